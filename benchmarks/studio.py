@@ -45,8 +45,25 @@ mean = [0.0]
 cov = [[1.0]]
 """
 PATIENCE = 300_000
-FRAMES = """() => new Promise((done) => { const steps = []; let last = performance.now(); const ends = last + 4000;
-  (function next(now) { steps.push(now - last); last = now; now < ends ? requestAnimationFrame(next) : done(steps.slice(1)); })(last); })"""
+FRAMES = """() => new Promise((done) => {
+  const steps = [], ends = performance.now() + 4000;
+  let last = performance.now();
+  (function next(now) {
+    steps.push(now - last);
+    last = now;
+    if (now < ends) requestAnimationFrame(next); else done(steps.slice(1));
+  })(last);
+})"""
+ASK = """async (texts) => {
+  const said = [];
+  for (const text of texts) {
+    try {
+      const found = await window.studio.link.ask("check", { text });
+      said.push(found.fault ?? null);
+    } catch (error) { said.push("error: " + error.message); }
+  }
+  return said;
+}"""
 
 
 @contextmanager
@@ -125,7 +142,8 @@ def memory() -> dict[str, object]:
         for count in (20, 200):
             page.evaluate("async (count) => { for (let k = 0; k < count; k++) await window.studio.run(); }", count)
             sizes.append(resident(process.pid))
-    return {"MiB after 20 runs": round(sizes[0]), "MiB after 220 runs": round(sizes[1]), "growth": round(sizes[1] / sizes[0] - 1, 3)}
+    growth = round(sizes[1] / sizes[0] - 1, 3)
+    return {"MiB after 20 runs": round(sizes[0]), "MiB after 220 runs": round(sizes[1]), "growth": growth}
 
 
 def resident(parent: int) -> float:
@@ -151,11 +169,7 @@ def texts() -> dict[str, object]:
             text[draw.randrange(len(text))] = draw.choice(list('"[]=x*(){}\n\0é9.#') + ["\u2028", "**", "e999"])
         bad.append("".join(text))
     with opened(SPIRAL, {"kind": "simulate", "until": 1, "step": 0.01, "seed": 1}) as (page, _):
-        said = page.evaluate(
-            "async (texts) => { const said = []; for (const text of texts) { try { const found = await window.studio.link.ask('check', { text });"
-            " said.push(found.fault ?? null); } catch (error) { said.push('error: ' + error.message); } } return said; }",
-            bad[:1000],
-        )
+        said = page.evaluate(ASK, bad[:1000])
         page.evaluate("() => window.studio.run()")
         expect(page.locator("#status")).to_contain_text("Filtered", timeout=PATIENCE)
     refused = [one for one in said if one is not None]

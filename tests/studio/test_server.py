@@ -14,6 +14,7 @@ from starlette.websockets import WebSocketDisconnect
 
 import zakai
 from studio.page import HOST, ORIGIN, PORT, Page, studio
+from zakai.studio.follow import Source
 
 SPIRAL = zakai.gallery.text("spiral-sensor")
 SIMULATED = {"kind": "simulate", "until": 1.0, "step": 0.02, "seed": 1}
@@ -196,6 +197,30 @@ def test_a_worker_that_the_system_ends_is_replaced(served, page: Page):
         pass
     assert "it needed more memory than it may have" in answer["error"]
     assert page.ask("describe", text=SPIRAL, data=SIMULATED)["rows"] == 50
+
+
+def test_a_file_that_grows_is_filtered_row_by_row(tmp_path):
+    path = tmp_path / "growing.csv"
+    model = zakai.load_model("gallery:spiral-sensor")
+    _, record = zakai.simulate(model, np.arange(1, 31) * 0.02, seed=3)
+    record.to_csv(tmp_path / "whole.csv")
+    lines = (tmp_path / "whole.csv").read_text().splitlines(keepends=True)
+    path.write_text("".join(lines[:11]) + "0.2,much,1\n")
+    client, token = studio(follow=Source(path))
+    with client, client.websocket_connect(f"/{token}/socket", headers={"host": HOST, "origin": ORIGIN}) as socket:
+        page = Page(client, token, socket)
+        assert page.hello["follow"] == "growing.csv"
+        page.send("follow", text=SPIRAL)
+        while (answer := page.receive())["do"] != "stream-lines":
+            assert "error" not in answer
+        assert answer["count"] == 10 and "line 12: 'much' is not a number" in answer["faults"][0]
+        with path.open("a") as file:
+            file.write("".join(lines[11:]))
+        while answer["count"] < 30:
+            answer = page.receive()
+        result = zakai.filter(model, record)
+        assert answer["mean"] == pytest.approx(result.mean[-1], rel=1e-9)
+        assert page.ask("picture", name="stream")["frame"].size > 1000
 
 
 def test_the_script_of_a_record_from_a_file_computes_the_same(page: Page, tmp_path):

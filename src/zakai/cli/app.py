@@ -221,7 +221,7 @@ def studio(
     no_browser: Annotated[bool, typer.Option("--no-browser", help="Print the address, and open no browser.")] = False,
     memory: Annotated[float, typer.Option(metavar="GIB", min=1.0, help="The most memory that a computation may take.")] = 4.0,
 ) -> None:
-    """Open a local page on which a model is written, a record is filtered, and the density is looked at."""
+    """Open a local page on which a model is written, a record is filtered, and the density is shown."""
     from zakai.cli import showing
 
     showing.studio(model, record, port, not no_browser, memory)

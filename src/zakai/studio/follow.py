@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import os
 import sys
 import threading
 from collections.abc import AsyncIterator
@@ -10,7 +11,7 @@ from pathlib import Path
 
 AT_ONCE = 1 << 17  # bytes
 MOST_KEPT = 1 << 24  # bytes of standard input that a page which is loaded again receives again
-PAUSE = 0.2  # seconds between two looks at a file
+PAUSE = 0.2  # seconds until a file is read again
 
 
 class Source:
@@ -57,7 +58,8 @@ class Source:
 
 def _read(blocks: asyncio.Queue[bytes], loop: asyncio.AbstractEventLoop) -> None:
     while True:
-        block = sys.stdin.buffer.read1(AT_ONCE)  # type: ignore[union-attr]
+        # Python's own reader would be locked by this thread when the interpreter ends.
+        block = os.read(sys.stdin.fileno(), AT_ONCE)
         try:
             asyncio.run_coroutine_threadsafe(blocks.put(block), loop).result()
         except RuntimeError:  # the server has ended

@@ -1,4 +1,4 @@
-"""Tasks that filter, and that look at a result."""
+"""Tasks that filter, and that draw a result."""
 
 from __future__ import annotations
 

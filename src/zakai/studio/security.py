@@ -26,7 +26,7 @@ def new_token() -> str:
 
 
 def headers_of(port: int) -> dict[str, str]:
-    """Return the headers of every answer: nothing is loaded from elsewhere, framed, kept, or told to another page."""
+    """Return the headers of every answer: nothing is loaded from elsewhere, framed or kept; no other page sees the address."""
     sockets = " ".join(f"ws://{name}:{port}" for name in NAMES)
     policy = (
         "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob: data:; "

@@ -204,17 +204,19 @@ class Studio:
         """Give the lines of the stream to the runner, as many at once as have arrived while it computed."""
         source = self.settings.follow
         if source is None:
-            why = "live: start zakai studio MODEL RECORD.csv to follow a growing file, or zakai studio MODEL - for standard input"
+            why = (
+                "stream: start zakai studio MODEL RECORD.csv to follow a file, or zakai studio MODEL - for standard input"
+            )
             await self.send(packed({**_names(request), "error": why}))
             return
-        await self.runner.ask({**request, "do": "live-begin", "channel": "live"})
+        await self.runner.ask({**request, "do": "stream-begin", "channel": "stream"})
         await self.runner.idle.wait()
         try:
             async for lines in source.batches():
-                await self.runner.ask({**_names(request), "do": "live-lines", "channel": "live", "lines": lines})
+                await self.runner.ask({**_names(request), "do": "stream-lines", "channel": "stream", "lines": lines})
                 await self.runner.idle.wait()
         except OSError as error:
-            await self.send(packed({**_names(request), "error": f"live: {source.name}: cannot be read: {error.strerror}"}))
+            await self.send(packed({**_names(request), "error": f"stream: {source.name}: cannot be read: {error.strerror}"}))
 
     async def stop_following(self) -> None:
         """End the stream, if one is followed."""

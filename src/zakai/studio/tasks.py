@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from zakai.errors import InputError
-from zakai.studio import after, exports, inspecting, live, running
+from zakai.studio import after, exports, inspecting, running, stream
 from zakai.studio.session import Answer, Report, Session
 
 TASKS: dict[str, Callable[..., Answer]] = {
@@ -14,7 +14,7 @@ TASKS: dict[str, Callable[..., Answer]] = {
     **running.TASKS,
     **after.TASKS,
     **exports.TASKS,
-    **live.TASKS,
+    **stream.TASKS,
 }
 
 

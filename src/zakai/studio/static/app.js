@@ -8,7 +8,7 @@ import { Editor } from "./editor.js";
 import { EXAMPLE } from "./example.js";
 import { Form } from "./form.js";
 import { Link, Superseded } from "./link.js";
-import { Live } from "./live.js";
+import { Stream } from "./stream.js";
 import { Method } from "./method.js";
 import { Observations, Residuals } from "./observations.js";
 import { Parameters } from "./parameters.js";
@@ -33,7 +33,7 @@ class Studio {
     this.method = new Method(this);
     this.tabs = new Map([
       ["parameters", new Parameters(this)], ["summary", new Summary(this)], ["observations", new Observations(this)], ["residuals", new Residuals(this)],
-      ["joint", new TwoStates(this)], ["compare", new Compare(this)], ["live", new Live(this)], ["algebra", new Algebra(this)], ["export", new Takeaway(this)],
+      ["joint", new TwoStates(this)], ["compare", new Compare(this)], ["stream", new Stream(this)], ["algebra", new Algebra(this)], ["export", new Takeaway(this)],
     ]);
     this.read = debounced(() => this._read(), TYPING);
     this.rest = debounced(() => this._rested(), RESTING);
@@ -41,7 +41,7 @@ class Studio {
     this._build();
     this.link.onhello = (hello) => this._begin(hello);
     this.link.onlost = (said) => this.say(said, true);
-    this.link.onlive = (header) => this.tabs.get("live").arrived(header);
+    this.link.onstream = (header) => this.tabs.get("stream").arrived(header);
     this.link.open();
   }
 
@@ -79,7 +79,7 @@ class Studio {
     Object.assign(this.state, stored ?? given);
     if (!stored && hello.record) this.state.data = { kind: "file", ...hello.record };
     this.editor.value = this.state.text;
-    this.tabs.get("live").offered(hello.follow);
+    this.tabs.get("stream").offered(hello.follow);
     this.data.draw();
     this._tab(this.tabs.has(this.state.tab) ? this.state.tab : "parameters");
     this._gallery();
@@ -167,7 +167,6 @@ class Studio {
     this.busy(true, "Filtering …");
     const found = await this.ask("run", { ...this.request, name: "main" }, { progress: (done, total) => this.progressed(done, total) });
     this.busy(false);
-    if (this.again) { this.again = false; if (found) { await this.run(); return; } }
     if (!found) return;
     this.summary = found;
     this.remember();
@@ -184,13 +183,15 @@ class Studio {
     document.body.classList.toggle("busy", on);
     this.progressed(0, null);
     if (on) this.say(said);
+    if (!on && this.again) { this.again = false; setTimeout(() => this.run()); } // what was wanted meanwhile
     clearTimeout(this.patience);
-    if (on) this.patience = setTimeout(() => this.running && this.say(`${said} The first run on a machine compiles kernels, which takes up to a minute.`), 6000);
+    if (on) this.patience = setTimeout(() => this.running && !this.reported && this.say(`${said} The first run on a machine compiles kernels, which takes up to a minute.`), 6000);
   }
 
   progressed(done, total) {
     const bar = byId("progress");
     bar.classList.toggle("open", !total);
+    this.reported = Boolean(total);
     if (total) {
       const share = Math.round((100 * done) / total);
       bar.setAttribute("aria-valuenow", share);

@@ -21,7 +21,7 @@ export function number(value, digits = 5) {
   if (value === null || value === undefined || !Number.isFinite(value)) return "–";
   const size = Math.abs(value);
   const plain = size === 0 || (size >= 1e-4 && size < 1e7);
-  return (plain ? String(Number(value.toPrecision(digits))) : value.toExponential(digits - 1)).replace(/-/g, "−");
+  return (plain ? String(Number(value.toPrecision(digits))) : value.toExponential(digits - 1).replace(/\.?0+e/, "e")).replace(/-/g, "−");
 }
 
 export const counted = (count, noun) => `${count.toLocaleString("en")} ${noun}${count === 1 ? "" : "s"}`;

@@ -9,7 +9,7 @@ export class Link {
     this.number = 0;
     this.waiting = new Map(); // number -> {channel, resolve, reject, progress}
     this.latest = new Map(); // channel -> number
-    this.onhello = this.onlost = this.onlive = () => {};
+    this.onhello = this.onlost = this.onstream = () => {};
     this.tries = 0;
   }
 
@@ -37,7 +37,7 @@ export class Link {
   }
 
   _answered({ header, arrays, shapes }) {
-    if (header.do === "follow" || header.do === "live-lines") { this.onlive(header); return; }
+    if (["follow", "stream-begin", "stream-lines"].includes(header.do)) { this.onstream(header); return; }
     const one = this.waiting.get(header.id);
     if (!one) return; // an answer that came late
     if (header.do === "progress") { one.progress?.(header.done, header.total); return; }

@@ -11,7 +11,7 @@ class Lazy {
 
   filtered() { this.seen = null; }
 
-  /** Ask when the part is looked at. */
+  /** Ask when the part is opened. */
   async open() {
     const { studio } = this;
     if (!studio.summary || this.seen === studio.summary || studio.running) return;

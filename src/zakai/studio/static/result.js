@@ -3,7 +3,7 @@
 import { DensityView } from "./density.js";
 import { byId, counted, h, number, segments } from "./dom.js";
 
-const NAMES = { main: "Filtered", smooth: "Smoothed", forecast: "Forecast", live: "Live" };
+const NAMES = { main: "Filtered", smooth: "Smoothed", forecast: "Forecast", stream: "Stream" };
 
 export class Result {
   constructor(studio) {
@@ -47,7 +47,7 @@ export class Result {
   }
 
   _buttons() {
-    const options = ["main", "smooth", "forecast", "live"].filter((name) => this.available.has(name) || name === "smooth" || name === "forecast")
+    const options = ["main", "smooth", "forecast", "stream"].filter((name) => this.available.has(name) || name === "smooth" || name === "forecast")
       .map((name) => ({ value: name, text: NAMES[name], testid: `show-${name}` }));
     segments(byId("shown"), options, this.name, (name) => this._choose(name));
   }

@@ -2,13 +2,13 @@
 
 import { h, number } from "./dom.js";
 
-export class Live {
+export class Stream {
   constructor(studio) {
     this.studio = studio;
-    this.title = "Live";
+    this.title = "Stream";
     this.button = h("button", { type: "button", class: "primary", "data-testid": "follow", onclick: () => this.toggle() }, "Follow");
     this.source = h("p", { class: "lead" });
-    this.said = h("p", { "data-testid": "live-said", role: "status" });
+    this.said = h("p", { "data-testid": "stream-said", role: "status" });
     this.estimate = h("dl", { class: "facts" });
     this.faults = h("ul", { class: "notes", hidden: true });
     this.panel = h("div", { class: "panel" }, this.source, h("div", { class: "row" }, this.button), this.said, this.estimate, this.faults);
@@ -38,6 +38,7 @@ export class Live {
       if (this.on) this.toggle();
       return;
     }
+    if (header.do === "stream-begin") return;
     this.faults.hidden = !header.faults.length;
     this.faults.replaceChildren(...header.faults.map((one) => h("li", {}, one)));
     if (header.time === null) return;
@@ -48,7 +49,7 @@ export class Live {
     if (now - this.drawn < 250 || this.drawing) return; // four pictures a second
     this.drawing = true;
     this.drawn = now;
-    await studio.result.show("live", { states: header.states, verdict: "", log_likelihood: header.log_likelihood, method: "live", observations: header.count, warnings: header.warnings, first: header.first, last: header.time });
+    await studio.result.show("stream", { states: header.states, verdict: "", log_likelihood: header.log_likelihood, method: "stream", observations: header.count, warnings: header.warnings, first: header.first, last: header.time });
     this.drawing = false;
   }
 }

@@ -16,10 +16,10 @@ from zakai.studio.data import Given
 from zakai.studio.running import method_of
 from zakai.studio.session import Answer, Held, Report, Session
 
-KEPT = 2_000  # estimates that can be looked at
+KEPT = 2_000  # estimates that can be drawn
 
 
-class Live:
+class Stream:
     """An online filter and its last estimates, in the shape of a result."""
 
     has_densities = True
@@ -30,7 +30,7 @@ class Live:
     def __init__(self, online: Any):
         self.online, self.model = online, online.model
         self.state = tuple(online.model.state)
-        self.method, self.header, self.lines = "", b"", 0
+        self.method, self.header, self.lines, self.count = "", b"", 0, 0
         self.estimates: deque[Any] = deque(maxlen=KEPT)
         self.log_likelihood, self.faults = 0.0, list[str]()
 
@@ -74,6 +74,7 @@ class Live:
             self.estimates.append(estimate)
             self.log_likelihood += float(estimate.log_likelihood_increment)
             used += 1
+        self.count += used
         self.lines += body.count(b"\n")
         self.faults = self.faults[-20:]
         return used
@@ -85,31 +86,31 @@ def begin(session: Session, request: Mapping[str, Any], report: Report) -> Answe
 
     model = session.model(request)
     method, options = method_of(request)
-    session.online = Live(online(model, method, **options))
+    session.online = Stream(online(model, method, **options))
     return {"states": list(model.state)}, {}
 
 
 def take(session: Session, request: Mapping[str, Any], report: Report) -> Answer:
     """Filter lines that have arrived, and return the last estimate."""
-    live = session.online
-    if live is None:
-        raise InputError("live: the stream has ended; press Follow again")
-    used = live.take(str(request.get("lines", "")))
-    if live.estimates:
-        session.keep("live", Held(live, None, Given(None, None, "live")))  # type: ignore[arg-type]
-    last = live.estimates[-1] if live.estimates else None
+    stream = session.online
+    if stream is None:
+        raise InputError("stream: the stream has ended; press Follow again")
+    used = stream.take(str(request.get("lines", "")))
+    if stream.estimates:
+        session.keep("stream", Held(stream, None, Given(None, None, "stream")))  # type: ignore[arg-type]
+    last = stream.estimates[-1] if stream.estimates else None
     return {
         "used": used,
-        "count": live.online.last is not None and len(live.estimates),
-        "faults": live.faults[-3:],
+        "count": stream.count,
+        "faults": stream.faults[-3:],
         "time": None if last is None else last.time,
         "mean": None if last is None else last.mean,
         "interval": None if last is None else last.interval(0.95),
         "warnings": [] if last is None else list(last.warnings),
-        "log_likelihood": live.log_likelihood,
-        "states": list(live.state),
-        "first": None if last is None else float(live.estimates[0].time),
+        "log_likelihood": stream.log_likelihood,
+        "states": list(stream.state),
+        "first": None if last is None else float(stream.estimates[0].time),
     }, {}
 
 
-TASKS: dict[str, Callable[..., Answer]] = {"live-begin": begin, "live-lines": take}
+TASKS: dict[str, Callable[..., Answer]] = {"stream-begin": begin, "stream-lines": take}
