@@ -46,7 +46,7 @@ from zakai.models.model import Model
 from zakai.numerics.line import window as lw
 from zakai.numerics.line.density import separated
 from zakai.numerics.line.product import General, multiplied
-from zakai.numerics.line.steps import RELIABLE
+from zakai.numerics.line.steps import RELIABLE, error_made
 from zakai.records.schedule import Schedule
 
 Array = Any
@@ -208,8 +208,7 @@ def single(prepared: Prepared, k: int, state: State, observed: np.ndarray) -> Si
         report.aliasing = max(report.aliasing, coarse)
     mean, variance = lw.moments(values, window)
     report.edge = max(report.edge, edge_of_moments(prepared, values, window))
-    made = 2.0 * report.aliasing + 10.0 * report.edge + report.time + 10.0 * report.negative
-    made += min(floor * report.growth, 1.0)
+    made = error_made(report.aliasing, report.edge, report.negative, report.time, floor * report.growth)
     retained = error_remainder(before[1], mean_and_variance[1], variance, spread(prepared, k, length, window.origin + mean.real))
     error = made + state.error * (1.0 if separated(np.ascontiguousarray(values.real)) else retained)
     error = max(error, RELIABLE * prepared.promised)

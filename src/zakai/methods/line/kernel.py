@@ -75,7 +75,7 @@ def _along(
         check, left, right, coarse = lw.grid_check(result, False, negligible, cut), True, True, False
         if result.any():
             left, right = check.left > 10 * cut, check.right > 10 * cut
-            coarse = check.aliasing > 30.0 * negligible and (check.aliasing > rough or not check.rough)
+            coarse = check.unresolved(negligible, rough)
         if not (left or right or coarse):
             mass = np.sum(result)
             return Prediction(result / mass, new, np.log(mass) + top + best, check)

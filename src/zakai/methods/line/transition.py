@@ -343,7 +343,7 @@ def by_decomposition(prepared: Prepared, values: Array, window: lw.Window, lengt
         if result is None or not lost(float(np.sum(result[0].real))) < 1e-3:
             return None
         check = lw.grid_check(result[0], window.closed, negligible)
-        if check.aliasing > 30.0 * negligible and (check.aliasing > rough or not check.rough):
+        if check.unresolved(negligible, rough):
             return None
         bound = max(EDGE, 4.0 * check.aliasing)
         left, right = check.left > bound, check.right > bound
@@ -422,7 +422,7 @@ def _by_substeps(
             if split:
                 break
             check = lw.grid_check(trial.values, window.closed, negligible)
-            coarse = check.aliasing > resolved and (check.aliasing > rough or not check.rough)
+            coarse = check.unresolved(negligible, rough)
             coarse = coarse and (not prepared.weak or known <= resolved)  # a finer grid has no more of the spectrum of a kink
             bound = max(EDGE, 4.0 * check.aliasing)
             left, right = check.left > bound, check.right > bound

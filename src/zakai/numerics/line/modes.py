@@ -51,6 +51,7 @@ from zakai.numerics.line.steps import (
     SIZE,
     UNRESOLVED,
     product,
+    step_error,
 )
 from zakai.numerics.line.window import CUT, LARGEST
 
@@ -428,7 +429,7 @@ def advance(
             edge = max(edge, on_left, on_right)
         row[1], row[2] = moments(now)[1:]
         # What the ends of the grid absorb is missing.
-        made = 2.0 * aliasing + 10.0 * (edge + negative) + rounding + unsure + missing + min(floor * growth, 1.0)
+        made = step_error(aliasing, edge, negative, rounding + unsure + missing, floor * growth)
         if not ((closed or not seen or max(on_left, on_right) < 1e-10) and made <= allowed):
             return i, FAILED
         ratio = min(max(np.sqrt(before * row[2]) * spacing / predicted, 0.3), 1.0)

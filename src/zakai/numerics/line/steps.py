@@ -342,6 +342,24 @@ def checked(
     return status, mass, aliasing, edge, negative, highest
 
 
+def error_made(aliasing: float, edge: float, negative: float, time: float, amplified: float) -> float:
+    """Return the error of a step, of the mean in standard deviations and of the log-likelihood.
+
+        2 aliasing + 10 (edge + negative) + time + min(amplified, 1)
+
+    Args:
+        aliasing: the spectrum that the grid does not resolve, relative to the mass: both its sides count.
+        edge: the density at the ends of the grid, relative to the maximum: what lies beyond counts with its squared distance.
+        negative: the negative share of the mass, which counts in the same way.
+        time: the errors of the transition in time and of rounding.
+        amplified: the error of small values of the density, times its growth by a sample.
+    """
+    return 2.0 * aliasing + 10.0 * (edge + negative) + time + min(amplified, 1.0)
+
+
+step_error = helper(error_made)
+
+
 @helper
 def copied(table: Array, start: int, to: Array) -> None:
     """Copy the columns of terms (R, 4 + m, T) from `start` on."""

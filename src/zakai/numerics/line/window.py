@@ -146,6 +146,10 @@ class GridCheck(NamedTuple):
     rough: bool
     resolving: float
 
+    def unresolved(self, negligible: float, noise: float) -> bool:
+        """Return whether a finer grid is needed: the spectrum is not negligible, and not that of kinks or noise up to a level."""
+        return self.aliasing > 30.0 * negligible and (self.aliasing > noise or not self.rough)
+
 
 def grid_check(values: Array, closed: bool, negligible: float = NEGLIGIBLE, cut: float = CUT) -> GridCheck:
     """Return the figures of a density.
