@@ -19,7 +19,7 @@ import numpy as np
 from scipy.special import expit
 
 from zakai.methods.line.coefficients import coefficients, covariance_at, resolved_parts
-from zakai.methods.line.message import FEWEST, Message, reliable
+from zakai.methods.line.message import MOST_GRIDS, Message, reliable
 from zakai.methods.line.model import finite
 from zakai.methods.line.prepared import Prepared, State, TimeInterval
 from zakai.methods.line.transition import (
@@ -34,11 +34,11 @@ from zakai.methods.line.transition import (
 )
 from zakai.methods.line.update import state_of
 from zakai.numerics.line import window as lw
+from zakai.numerics.line.backward import FEWEST, ROUNDING
 from zakai.numerics.line.density import support
 
 Array = Any
 
-ROUNDING = 1e-15  # of the maximum: the error of psi by rounding
 DEGREE = 8  # of the polynomial l that follows a density
 DEPTH = -20.0  # logarithm of the density, relative to its maximum, beyond which l is linear
 BLEND = 3.0  # spacings over which it becomes linear
@@ -147,7 +147,6 @@ def _logarithms(density: Array, z: Array) -> Array:
 WIDTH = 8.8  # standard deviations of psi from its mean to the ends of a grid
 MARGIN = 1.2  # of a wider grid
 ROUGH = 1e-3  # of the tolerance that noise of psi may leave
-MOST_GRIDS = 7  # that are finer or wider
 STANDS = 1.0  # deviations by which a message may move and change its width on a grid that stands
 BEYOND = 1.3  # length of such a grid, in ranges of the product
 MOST_PARTS = 16  # of an interval

@@ -18,7 +18,6 @@ import numpy as np
 
 from zakai.methods.line.coarse import coarsened
 from zakai.methods.line.coefficients import (
-    EDGE,
     GROWTH,
     coefficients,
     covariance_at,
@@ -39,6 +38,7 @@ from zakai.numerics.line.averages import GAUSS_NODES, GAUSS_WEIGHTS
 from zakai.numerics.line.grid_choice import REACH
 from zakai.numerics.line.operator import FourierOperator, exponential_of
 from zakai.numerics.line.product import finer
+from zakai.numerics.line.window import EDGE
 
 Array = Any
 

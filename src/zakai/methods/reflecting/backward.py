@@ -43,6 +43,7 @@ from zakai.methods.reflecting.elements import (
 )
 from zakai.methods.reflecting.filter import State
 from zakai.numerics.line import window as lw
+from zakai.numerics.line.backward import ROUNDING
 from zakai.numerics.line.density import support
 from zakai.numerics.lobatto import Element
 
@@ -127,7 +128,6 @@ POINTS = 256  # of a message, on the whole element of the density
 MODES_REACH = 4.0  # standard deviations of the noise around the supports of density and message
 QUADRATURE = 192  # points at which a message is projected onto the modes
 SHARE = 1e-2  # of the tolerance that modes may leave
-ROUNDING = 1e-15  # of the maximum: smaller values of a message are not kept
 
 
 def _window(prepared: Prepared, lower: float, upper: float) -> lw.Window:

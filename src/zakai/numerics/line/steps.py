@@ -274,7 +274,7 @@ def exponent_added(h: Array, centre: Array, precision: Array, observed: Array, w
     return constant
 
 
-_OVERFLOW = 690.0
+OVERFLOW = 690.0  # exponent below which exp is finite
 _LEAST = 1e-280  # value of a density where its product with a likelihood is largest
 _MOST_GROWTH = 1e80
 
@@ -399,11 +399,11 @@ def product(now: Array, b: Array) -> tuple[float, float, float]:
         return np.nan, growth, depth
     reference, scale, factors = np.log(largest), 1.0 / now[top], np.empty(now.size)
     for j in range(now.size):
-        factors[j] = min(b[j] - b[top], _OVERFLOW)
+        factors[j] = min(b[j] - b[top], OVERFLOW)
     exponentiate(factors)
     for j in range(now.size):
         growth += factors[j]
-        now[j] = now[j] * scale * factors[j] if b[j] - b[top] < _OVERFLOW else np.exp(logs[j] + b[j] - best)
+        now[j] = now[j] * scale * factors[j] if b[j] - b[top] < OVERFLOW else np.exp(logs[j] + b[j] - best)
         total += now[j]
     for j in range(now.size):
         now[j] /= total

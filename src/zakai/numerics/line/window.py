@@ -66,6 +66,7 @@ SMALL = 1e-8  # density relative to its maximum below which its logarithm is int
 NEGLIGIBLE = 1e-13  # spectrum relative to the mass that need not be resolved
 TOGETHER = 256  # points at which values of a large grid are interpolated together
 GROSS = 1e-4  # spectrum at the highest frequencies from which it is that of what a grid does not resolve, not of noise
+EDGE = 1e-11  # density at the outermost points, relative to the maximum, that a grid may cut off
 ALIGNMENT = 8  # centres stand at multiples of so many spacings
 
 
