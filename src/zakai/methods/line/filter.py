@@ -52,8 +52,8 @@ from zakai.records.schedule import Schedule
 Array = Any
 
 SLOW = 1e-2  # of the tolerance: the spectrum that need not be resolved where f has kinks
-SLOW_GENEROUS = 256  # points of a grid that is kept though fewer would do
-GENEROUS = 96  # points of a grid that is kept though fewer would do
+SLOW_GENEROUS = 256  # points of a grid that is retained though fewer would do
+GENEROUS = 96  # points of a grid that is retained though fewer would do
 PILED = 0.5  # density at an end of the grid, relative to the maximum, of a product that is cut off there
 
 
@@ -82,7 +82,7 @@ def step(prepared: Prepared, k: int, state: State, observed: np.ndarray) -> tupl
         product = loop.one(prepared, k, state, observed)
         if product is not None:
             return product
-    # Attempts that overflow are taken again in shorter substeps.
+    # A substep that overflows is repeated in shorter ones.
     with np.errstate(all="ignore"):
         stepped = single(prepared, k, state, observed)
     return stepped.state, stepped.info
@@ -201,7 +201,7 @@ def single(prepared: Prepared, k: int, state: State, observed: np.ndarray) -> Si
         report.density(check)
     elif check is None or prepared.kinked:
         check = grid_check(prepared, values, window)
-    # A large grid is kept only where its decomposition serves the next intervals too.
+    # A large grid is retained only where its decomposition serves the next intervals too.
     generous = prepared.generous if report.decomposed else min(prepared.generous, GENEROUS)
     new_values, new, coarse = on_fitting_grid(prepared, values, window, check, generous)
     if new != window and not prepared.weak:  # the largest grid may be too coarse for all that the density has

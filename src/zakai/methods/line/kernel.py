@@ -13,7 +13,7 @@ from zakai.numerics.line.gaussian_kernels import WIDE, Channel, applied, around,
 
 Array = Any
 
-SAME_SPACING = 160  # points up to which the spacing of a grid is kept where it is enlarged
+SAME_SPACING = 160  # points up to which the spacing of a grid is retained where it is enlarged
 NARROWEST = 1.4  # spacings that the standard deviation of a kernel must have
 MOST_GRIDS = 13
 

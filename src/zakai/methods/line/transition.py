@@ -285,7 +285,7 @@ def by_modes(prepared: Prepared, values: Array, window: lw.Window, length: float
 
 
 MOST_SUBSTEPS = 4000
-FEW = 24  # substeps of an interval, after which no large grid is taken
+FEW = 24  # substeps of an interval, after which no large grid is used
 
 
 class Report:
@@ -321,7 +321,7 @@ class RecordedTransition(NamedTuple):
 
 
 class Prediction(NamedTuple):
-    """The density after an interval, its grid, the logarithm of its mass, its figures, and how it was moved, where known."""
+    """The density after an interval, its grid, the logarithm of its mass, its grid check, and the transitions, where known."""
 
     values: Array
     window: lw.Window
@@ -371,7 +371,7 @@ def by_substeps(
     report: Report,
     moving: bool = False,
 ) -> Prediction:
-    """Return the density after an interval, by exponentials of its operator, on grids that move with it or stand."""
+    """Return the density after an interval, by exponentials of its operator, on grids that move with it or are fixed."""
     result, tails = _by_substeps(prepared, values, window, interval, report, moving)
     if NOISE * np.exp(min(tails, 690.0)) > 0.1 * prepared.tolerance:
         # Increments far from the density may multiply rounding errors in its tails: compare with a density that has more of them.

@@ -49,7 +49,7 @@ from zakai.numerics.lobatto import Element
 
 Array = Any
 
-PIECE = 10.0  # standard deviations of the noise in which states at the end are taken together
+PIECE = 10.0  # standard deviations of the noise in which states at the end share a transition
 REACH = 8.0  # of them around, between which the state at the start lies
 RESOLVING = 3.7  # points in a standard deviation
 RESOLVED = 1e-6  # Legendre coefficient of a density that the points of the transition resolve

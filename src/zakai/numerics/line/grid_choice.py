@@ -121,7 +121,7 @@ def placed(
         for c in range(done, count):
             highest, top, bottom = _surveyed(left[c], width[c], logs, likelihood, weights, h)
             level[c, 0], level[c, 1], level[c, 2], best = highest, top, bottom, max(best, highest)
-        # What is not left out is kept at the front, what is to be divided at the back.
+        # Cells that are done go to the front, cells to be divided to the back.
         retained, more = done, MOST_CELLS
         for c in range(done, count):
             highest, spread = level[c, 0], level[c, 1] - level[c, 2]

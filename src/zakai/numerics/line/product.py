@@ -1,4 +1,4 @@
-"""The product of a density on a grid with a likelihood that may be much narrower, stand far in its tails, or have kinks.
+"""The product of a density on a grid with a likelihood that may be much narrower, lie far in its tails, or have kinks.
 
 Of a function F with a kink, sums over a grid of F times a smooth function are accurate to second order only, and operators that
 contain F too.  With the values
@@ -77,7 +77,7 @@ Likelihood = Gaussian | General
 
 
 class Product(NamedTuple):
-    """The normalised product on its grid, the logarithm of its mass, and how deep in the tails of the density it stands.
+    """The normalised product on its grid, the logarithm of its mass, and how deep in the tails of the density it lies.
 
     `growth` is the factor by which an error that is uniform, relative to the maximum of the density, is relative to the product.
     """

@@ -278,7 +278,7 @@ class Interval(NamedTuple):
     """What the filter did in an interval on a grid.
 
     `observed` (m,) acts `inside` the interval or not at all; `pairs` of averages of the coefficients, zero for the mean, were
-    taken in `substeps`, with a kernel that is `narrow` in spacings or not.
+    used in `substeps`, with a kernel that is `narrow` in spacings or not.
     """
 
     length: float
