@@ -24,7 +24,7 @@ PAIR = zakai.Model(
 
 def record_of(model):
     inputs = zakai.Inputs([0.0, 0.6], np.ones((2, 1))) if model.inputs else None
-    return zakai.simulate(model, np.arange(0.1, 2.05, 0.1), seed=1, inputs=inputs)[1]
+    return zakai.simulate(model, np.arange(0.1, 0.85, 0.1), seed=1, inputs=inputs)[1]
 
 
 @pytest.mark.parametrize("model", [WELLS, PAIR], ids=["one state with an input", "two blocks"])

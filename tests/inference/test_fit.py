@@ -349,3 +349,30 @@ def test_a_far_start_leads_to_the_maximum_and_keeps_the_signs(start):
     assert far.converged and far.warnings == []
     assert far.log_likelihood == pytest.approx(near.log_likelihood, abs=1e-3)
     assert far.estimates["tau"] == pytest.approx(near.estimates["tau"], rel=1e-3)
+
+
+def test_a_start_from_a_plateau_leads_to_the_maximum():
+    # With tau = 0.02 a state is forgotten between two observations: only sigma^2 tau counts, and the search ends anywhere.
+    model = zakai.Model(
+        state=["x"], drift=["-x/tau"], diffusion=[["sigma"]], observation=["x"], observation_kind="samples",
+        observation_noise=[[0.01]], prior={"kind": "gaussian", "mean": [0], "cov": [[1]]},
+        parameters={"tau": 1.0, "sigma": 1.0},
+    )  # fmt: skip
+    _, record = zakai.simulate(model, 0.1 * np.arange(1, 201), seed=0)
+    near, far = zakai.fit(model, record), zakai.fit(model, record, start={"tau": 0.02, "sigma": 30.0})
+    assert near.converged and not near.warnings
+    assert far.converged and not far.warnings
+    assert far.log_likelihood == pytest.approx(near.log_likelihood, abs=1e-4)
+    assert far.estimates == pytest.approx(near.estimates, rel=1e-3)
+
+
+def test_a_fit_that_takes_long_is_announced(monkeypatch, caplog):
+    from zakai import _progress
+
+    monkeypatch.setattr(_progress, "FIRST", 0.001)
+    model = zakai.Model(
+        state=["x"], drift=["-a*x"], observation=["x"], observation_kind="samples", parameters={"a": 1.0},
+        prior={"kind": "gaussian", "mean": [0], "cov": [[1]]},
+    )  # fmt: skip
+    zakai.fit(model, zakai.Record([0.5, 1.0, 1.5], [0.4, 0.3, 0.1], "samples"))
+    assert "fit: the search for the largest log-likelihood by a takes more than" in caplog.text

@@ -195,11 +195,63 @@ def test_smoothing_and_paths_agree_with_the_kalman_smoother():
     model = zakai.Model(**{**LINEAR["samples"], "observation": ["2*x", "v"]})
     record = record_of(model, 10)
     ours, exact = zakai.smooth(model, record, PARTICLES), zakai.smooth(model, record, "kalman-bucy")
-    assert np.sqrt(np.mean((ours.mean - exact.mean) ** 2 / exact.variance)) < 0.12
+    errors = (ours.mean - exact.mean) / ours.mean_standard_error
+    assert np.sqrt(np.mean(errors**2)) < 1.6 and np.nanmax(ours.error_estimate) < 0.2
     assert np.allclose((ours.variance / exact.variance)[1:], 1.0, atol=0.3)
     paths, expected = ours.sample_paths(400), exact.sample_paths(400)
     steps, known = (np.diff(drawn[:, :, 0], axis=1).var(axis=0) for drawn in (paths, expected))
     assert np.allclose(steps / known, 1.0, atol=0.5) and paths.shape == (400, 11, 2)
+
+
+SMOOTHED = {
+    "a small noise": {**OSCILLATOR, "diffusion": [["0"], ["0.05"]], "observation": ["x"], "observation_noise": [["0.25"]]},
+    "a coefficient": {
+        **OSCILLATOR, "drift": ["v - 0.5*x", "0"], "diffusion": [["0.3"], ["0"]], "observation": ["x"],
+        "observation_noise": [["0.04"]],
+    },
+    "increments": {
+        **OSCILLATOR, "observation": ["2*x"], "observation_noise": [["0.3"]], "observation_kind": "increments",
+    },
+}  # fmt: skip
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("name", SMOOTHED)
+def test_smoothed_means_agree_with_the_kalman_smoother_within_their_standard_errors(name):
+    model = zakai.Model(**{"observation_kind": "samples", **SMOOTHED[name]})
+    record = record_of(model, 20, 0.3 if name != "increments" else 0.1, gaps=False)
+    exact = zakai.smooth(model, record, "kalman-bucy")
+    errors, reported = [], []
+    for seed in range(3):
+        ours = zakai.smooth(model, record, PARTICLES, particles=3000, seed=seed)
+        errors.append((ours.mean - exact.mean) / np.sqrt(exact.variance))
+        reported.append(ours.mean_standard_error / np.sqrt(exact.variance))
+    errors, reported = np.array(errors), np.array(reported)
+    assert np.sqrt(np.mean(errors**2)) < 0.07
+    assert 0.7 < np.sqrt(np.mean(reported**2) / np.mean(errors**2)) < 1.5
+
+
+def test_smoothed_means_of_a_nonlinear_system_agree_with_the_smoother_on_a_grid():
+    model = zakai.Model(
+        state=["x"], drift=["x - x**3"], diffusion=[["0.6"]], observation=["x**2 + x"], observation_kind="samples",
+        observation_noise=[["0.2"]], prior={"kind": "gaussian", "mean": [0.0], "cov": [1.0]},
+    )  # fmt: skip
+    record = record_of(model, 12, 0.4, gaps=False)
+    ours, exact = zakai.smooth(model, record, PARTICLES), zakai.smooth(model, record, "yau-yau")
+    assert np.sqrt(np.mean(((ours.mean - exact.mean) / ours.mean_standard_error) ** 2)) < 1.7
+    assert np.allclose(ours.variance / exact.variance, 1.0, atol=0.25)
+    assert "evidence_error" not in ours.health and ours.log_likelihood_standard_error > 0
+
+
+def test_draws_without_a_past_join_particles_that_lead_to_them(monkeypatch):
+    from zakai.methods.particles import window
+
+    monkeypatch.setattr(window, "INTERVALS", 3)
+    model = zakai.Model(**{**OSCILLATOR, "diffusion": [["0"], ["0.1"]], "observation": ["x"], "observation_kind": "samples"})
+    record = record_of(model, 12, gaps=False)
+    ours, exact = zakai.smooth(model, record, PARTICLES), zakai.smooth(model, record, "kalman-bucy")
+    assert np.nanmax(ours.health["joined"]) > 0
+    assert np.sqrt(np.mean((ours.mean - exact.mean) ** 2 / exact.variance)) < 0.2
 
 
 def test_residuals_forecasts_and_a_later_prior_come_from_the_particles(tmp_path):

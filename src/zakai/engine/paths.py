@@ -45,7 +45,7 @@ def sample_paths(runs: Sequence[SmoothingRun], places: Sequence[Sequence[int]], 
             f"{max(1, int(LARGEST_BYTES / (8.0 * n * times)))} paths at once"
         )
     for run in runs:
-        if run.backward.draw is None:
+        if run.backward.draw is None and run.backward.paths is None:
             raise InputError(
                 f"sample_paths: the method {run.setting.method.name} does not draw paths; take yau-yau for up to four "
                 "states, or kalman-bucy, benes, hu-yau or general-direct, where one holds"
@@ -72,6 +72,20 @@ class _Paths:
         self.inaccurate = 0  # intervals whose laws are not near to normal in the smallest parts
 
     def __iter__(self) -> Any:
+        return self._by_messages() if self.run.backward.paths is not None else self._by_draws()
+
+    def _by_messages(self) -> Any:
+        run = self.run
+        assert run.backward.paths is not None
+        message = run.backward.paths(run.empty, run.state, self.count, int(self.rng.integers(1, 2**32)))
+        yield len(run.schedule), message.draws.T
+        for number in reversed(range(len(run.segments))):
+            rows, prepared, begin, states = run._segment(number)
+            for k in reversed(rows):
+                message = run.backward.step(prepared, k - begin, message, run.values[k], states[k - rows.start])
+                yield k, message.draws.T
+
+    def _by_draws(self) -> Any:
         run = self.run
         paths = run.setting.method.density(run.empty, run.state).sample(self.rng, self.count)
         yield len(run.schedule), paths

@@ -174,10 +174,10 @@ class SmoothingRun(Run):
     """One record on its way through one method, and back."""
 
     def __init__(self, setting: Setting, record: Record):
-        super().__init__(setting, record, "moments")
         backward = setting.method.backward
         if backward is None:
             raise InputError(_refusal(setting))
+        super().__init__(setting._replace(options={**setting.options, **backward.options}), record, "moments")
         self.backward = backward
         backward.message(self.empty, self.state)  # a model without a smoother is refused before it is filtered
         self.segments: list[tuple[int, Any]] = []  # the first interval of each, and the state at its start
@@ -207,7 +207,8 @@ class SmoothingRun(Run):
 
     def smooth(self, report: Callable[[Run, int], None], step: Callable[[Run], None]) -> None:
         """Replace the filter's moments by the smoothed ones; `report` and `step` are called as by `all`."""
-        forward = joined(self.parts).log_likelihood_increment
+        filtered = joined(self.parts)
+        forward = filtered.log_likelihood_increment
         message = self.backward.message(self.empty, self.state)
         expected, self.parts, self.messages = 0.0, [], [None] * len(self.segments)
         for number in reversed(range(len(self.segments))):
@@ -215,15 +216,26 @@ class SmoothingRun(Run):
             self.messages[number] = message
             here = slice(rows.start - begin, rows.stop - begin)
             message, infos = self._backward(prepared, here, states, message, rows, partial(step, self))
-            errors = np.abs(infos.log_likelihood_increment - np.append(forward[rows.start + 1 : rows.stop], expected))
-            health = {**infos.health, "evidence_error": errors}
-            self.parts.append(infos._replace(log_likelihood_increment=forward[rows.start : rows.stop], health=health))
+            health = dict(infos.health)
+            if not self.setting.method.random:
+                own = np.append(forward[rows.start + 1 : rows.stop], expected)
+                health["evidence_error"] = np.abs(infos.log_likelihood_increment - own)
+            here = slice(rows.start, rows.stop)
+            known = filtered.log_likelihood_standard_error
+            self.parts.append(
+                infos._replace(
+                    log_likelihood_increment=forward[here], health=health,
+                    log_likelihood_standard_error=None if known is None else known[here],
+                )
+            )  # fmt: skip
             expected = float(forward[rows.start])
             report(self, len(rows))
         self.parts.reverse()
         _, info = self.backward.smoothed(self.empty, self.first, message)
-        error = abs(float(info.log_likelihood_increment) - expected)
-        self.start = info._replace(health={**info.health, "evidence_error": error})
+        if not self.setting.method.random:
+            error = abs(float(info.log_likelihood_increment) - expected)
+            info = info._replace(health={**info.health, "evidence_error": error})
+        self.start = info
 
     @one_thread
     def _backward(
@@ -289,7 +301,10 @@ class SmoothingRun(Run):
         result._density = self.density
         for name, figures in result.health.items():
             figures[0] = self.start.health[name]
-        result.bounds = {**result.bounds, "evidence_error": (self.backward.accuracy(self.empty), _EVIDENCE)}
+        if "evidence_error" in result.health:
+            result.bounds = {**result.bounds, "evidence_error": (self.backward.accuracy(self.empty), _EVIDENCE)}
+        if result.mean_standard_error is not None and self.start.mean_standard_error is not None:
+            result.mean_standard_error[0] = self.start.mean_standard_error
         result.warnings = [*self.notes, *super().health_warnings(result)]
         result.increment_law_error = None  # `smooth` gives that of the filter
         return result

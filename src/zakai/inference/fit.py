@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from zakai import _display
-from zakai._progress import bar
+from zakai._progress import announced, bar
 from zakai.densities import GaussianMixture
 from zakai.engine.driver import filter as run_filter
 from zakai.engine.driver import planned, with_inputs
@@ -172,7 +172,8 @@ def fit(
     if any(setting.method.random for setting in planned(now, None, method, options, by_value=False).settings):
         return _fit_of_draws(now, record, names, values, box, method, options)
     function, known = LogLikelihood(now, record, method, names, options), dict[bytes, tuple[float, np.ndarray]]()
-    with bar("fitting: log-likelihood and gradient") as advance:
+    what = f"{model.source}: fit: the search for the largest log-likelihood by {listing(names)}"
+    with bar("fitting: log-likelihood and gradient") as advance, announced(what):
 
         def counted(theta: np.ndarray) -> tuple[float, np.ndarray]:
             key = theta.tobytes()
@@ -228,7 +229,8 @@ def _fit_of_draws(
         at = model.with_parameters(**dict(zip(names, theta.tolist(), strict=True)))
         return run_filter(at, record, method, keep="moments", **{**options, "seed": first + seed})
 
-    with bar("fitting: log-likelihood") as advance:
+    what = f"{model.source}: fit: the search for the largest log-likelihood by {listing(names)}"
+    with bar("fitting: log-likelihood") as advance, announced(what):
 
         def value(theta: np.ndarray, seed: int) -> float:
             key = theta.tobytes(), seed

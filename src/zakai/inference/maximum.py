@@ -22,6 +22,8 @@ LIMIT = 0.1  # nats: the most that can be gained before values without a log-lik
 ROUNDS = 4  # of a search in all parameters and one along a limit
 FAR = 10.0  # factor by which a parameter may change before a search in logarithms is tried, too
 MOST_FACTORS = 6  # of this size, one after another
+DECADES = 2  # by which each parameter is varied where a search has ended on a plateau
+MOST_TRIALS = 50  # of parameters so varied, drawn at random where there are more
 HALVINGS = 20  # of a step that leads to such values
 EVEN = 1e-9  # relative difference of log-likelihoods that are the same
 SINGULAR = 1e-6  # the smallest eigenvalue of the information scaled to a unit diagonal; differences leave 1e-8
@@ -172,7 +174,8 @@ def maximum(
 
     Where a parameter has changed its sign or its size by far, which may lead across a pole, a second search keeps the signs, in
     the logarithms of the sizes, and the higher end counts.  Where the search ends at values from which the log-likelihood curves
-    upwards, it goes on from the best ones in that direction.
+    upwards, it goes on from the best ones in that direction; where it ends on a plateau, from the best of the values that are
+    larger and smaller than the first ones by up to two decades.
     """
     found = _maximum(function, values, box, names, model, exists)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -190,7 +193,32 @@ def maximum(
         if not later.log_likelihood > found.log_likelihood:
             break
         found = replace(later, iterations=found.iterations + later.iterations)
+    start = _beside_plateau(function, found, values, box)
+    if start is not None:
+        later = _maximum(function, start, box, names, model, exists)
+        if later.log_likelihood > found.log_likelihood + LIMIT:
+            found = replace(later, iterations=found.iterations + later.iterations)
     return found
+
+
+def _beside_plateau(function: Function, found: Found, values: np.ndarray, box: np.ndarray) -> np.ndarray | None:
+    """Return the best values within two decades of the first ones, where a search has found no information.
+
+    None where there was some, or no better values.
+    """
+    if np.isfinite(np.diag(found.covariance)).any() or found.beyond is not None:
+        return None
+    decades = np.arange(-DECADES, DECADES + 1)
+    if len(decades) ** len(values) <= MOST_TRIALS:
+        factors = np.stack(np.meshgrid(*[decades] * len(values)), axis=-1).reshape(-1, len(values))
+    else:
+        factors = np.random.default_rng(0).integers(-DECADES, DECADES + 1, (MOST_TRIALS, len(values)))
+    best, start = found.log_likelihood + LIMIT, None
+    for trial in np.clip(values * 10.0**factors, box[:, 0], box[:, 1]):
+        value = function(trial)[0]
+        if np.isfinite(value) and value > best:
+            best, start = value, trial
+    return start
 
 
 def _by_size(function: Function, values: np.ndarray, box: np.ndarray) -> np.ndarray:

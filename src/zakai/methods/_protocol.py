@@ -117,7 +117,12 @@ class Backward(Generic[P, S, M]):
     the draws `later` (P, n) at its end, and how far their law is from what is drawn: zero where it is exact, else a figure that
     falls with the length of the interval, which is divided above a bound.
 
+    Optional: `paths(prepared, state, count, seed)` returns the message at the last time of so many draws, where a message is
+    draws, its `draws` (n, P): those of consecutive messages are paths.  Only one of `draw` and `paths` is needed.
+
     Optional: `accuracy(prepared)` is the error of the evidence of one interval, in nats, beyond which a result warns.
+
+    Optional: `options` are those of the method with which a record is filtered before the backward pass.
 
     `message`, `smoothed` and `density` use of `prepared` only what does not depend on the schedule.
     """
@@ -129,6 +134,8 @@ class Backward(Generic[P, S, M]):
     segment: Callable[[P, slice, Sequence[S], M, np.ndarray], tuple[M, Infos] | None] | None = None
     draw: Callable[[P, int, np.ndarray, np.ndarray, S, np.random.Generator], tuple[np.ndarray, float]] | None = None
     accuracy: Callable[[P], float] = lambda prepared: 1e-6
+    paths: Callable[[P, S, int, int], M] | None = None
+    options: Mapping[str, Any] = field(default_factory=dict)
 
 
 def through(

@@ -52,7 +52,8 @@ class Chart:
 
     Example:
         chart = Chart()
-        chart.panel("residuals", axis("probability", 0, 1), axis("density")).add("bars", middles, heights, width=0.1)
+        panel = chart.panel("residuals", axis("probability", 0, 1), axis("density"))
+        panel.add("bars", [0.25, 0.75], [0.9, 1.1], width=0.5)
         chart.frame()
     """
 

@@ -26,6 +26,7 @@ _TAIL = 1e-6  # probability of a component, or beyond either end, that is not dr
 _REACH = 5.5  # standard deviations of a Gaussian in its window
 _SHOWN = 1e-5  # of the largest cell: a window is narrowed to the cells above
 _FINEST = 64  # points of a cell
+_BIN = 1 / 8  # standard deviations of kernels that are drawn together
 _POINT = 1e-9  # half a window of a state that is known exactly, relative to its size
 
 _Column = tuple[float, float, np.ndarray]  # the ends of the window, and the values in its cells, up to a factor
@@ -162,6 +163,13 @@ def _of_mixture(density: GaussianMixture, rows: int) -> _Column:
 def _mixture_between(
     weights: np.ndarray, means: np.ndarray, deviations: np.ndarray, low: float, high: float, rows: int
 ) -> np.ndarray:
+    if len(means) > 2 * rows and (deviations == deviations[0]).all():
+        # Kernels of one width: their means are moved to the middles of bins, which adds (1 / 8)^2 / 12 to the variance 1.
+        width = _BIN * float(deviations[0])
+        bins = np.floor((means - low) / width).astype(int)
+        weights = np.bincount(bins - bins.min(), weights)
+        means = low + width * (bins.min() + np.arange(len(weights)) + 0.5)
+        deviations = np.full(len(weights), deviations[0])
     values, cell = np.empty(rows), (high - low) / rows
     within = min(_FINEST, max(1, math.ceil(2.0 * cell / float(deviations.min()))))
     parts = (np.ascontiguousarray(part, dtype=float) for part in (weights, means, deviations))

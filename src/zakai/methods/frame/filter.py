@@ -30,6 +30,7 @@ AUDIT = 10  # intervals between comparisons of s and 2 s substeps, where the las
 # The difference of s and 2 s substeps in L1 is the error of s substeps times 3 / 4: with this share of the tolerance s are taken.
 # What is extrapolated from both has a third to a twentieth of it.
 TIME_SHARE, GAIN, ACCEPTED, SAFETY = 1.0, 4.0, 8.0, 0.7
+IN_TAILS = 0.03  # error of a mean over tolerance e^depth: linear tracks with observations 4 and 6 deviations away
 WITHIN = 3.0  # tolerances that the error of a mean may reach
 FIGURES = (
     "error_estimate", "tolerance_ratio", "rank", "mass_defect", "off_grid_error", "edge_mass", "tail_depth", "powers",
@@ -155,6 +156,9 @@ def _step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[Stat
     # Errors of different builds have different signs; the error of a mean is about half of the error in L1 at most.
     kept = _kept(prediction, prepared, cov)
     error = math.hypot(kept * control.error, 0.5 * (off_grid + prediction.defect + edge + time.error))
+    # Far out a density is known relative to its largest value only; the mean is at most as far off as the observation was.
+    far = min(IN_TAILS * rule.tolerance * math.exp(min(depth, 50.0)), math.sqrt(2.0 * max(depth, 0.0)))
+    error = math.hypot(error, far)
     health = {
         "error_estimate": error,
         "tolerance_ratio": error / (WITHIN * prepared.tolerance),

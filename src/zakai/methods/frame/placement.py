@@ -20,7 +20,9 @@ Array = Any
 # a density that is not Gaussian; with .03 alone that adds up over substeps (a robot with a wide heading: .007 deviations).
 TOGETHER, TOGETHER_TOLERANCES = 0.03, 1.0
 LEFT_OUT = 1e-3  # share of the tolerance that a box may leave out: every separated part with more mass is kept
+CHANCE = 2.0  # standard errors of a correlation that chance explains
 REACH = 1.3  # of the extreme of the mass
+MOST_POINTS = 160  # along an axis: two modes with twenty deviations between them
 FEWEST_POINTS = 10  # along an axis: six splines and two points beyond both ends
 LINES = 3  # through the mass, and one more through the point that counts most for fourth moments
 FIRST_LINE = 40  # points along a line at first; doubled where the spectrum fills half of them
@@ -87,8 +89,8 @@ class Rule(NamedTuple):
 
     @classmethod
     def of(cls, tolerance: float) -> Rule:
-        """Return the rule for a tolerance: beyond the width a Gaussian is below it, by the share that quintic splines need."""
-        return cls(tolerance, math.sqrt(2 * math.log(1 / tolerance)) + 0.7, 64)
+        """Return the rule for a tolerance: a Gaussian is below it beyond the width."""
+        return cls(tolerance, math.sqrt(2 * math.log(1 / tolerance)) + 0.7, MOST_POINTS)
 
 
 def frame_of(P: Array, Q: Array | None, together: float) -> tuple[Array, Array]:
@@ -112,6 +114,18 @@ def frame_of(P: Array, Q: Array | None, together: float) -> tuple[Array, Array]:
         V[:, rows] = group @ (q * np.where(np.diag(r) < 0, -1.0, 1.0))
         free, start = [i for i in free if i not in rows], stop
     return C @ V, V.T @ T @ V
+
+
+def without_chance(P: Array, count: float) -> Array:
+    """Return a covariance without correlations between groups of states, where chance may explain all between two groups.
+
+    With chance correlations in its frame, a density of 2^6 modes on the axes has twenty times the ranks.
+    """
+    d = np.sqrt(np.maximum(np.diag(P), 1e-300))
+    linked = np.abs(P / d / d[:, None]) >= CHANCE / math.sqrt(count)
+    for _ in range(len(P)):  # paths of any length
+        linked = linked @ linked
+    return np.where(linked, P, 0.0)
 
 
 def closed_axes(mass: Mass, angles: Array, rule: Rule) -> Array:
@@ -145,6 +159,7 @@ def place(
         stretch: a factor of the box.
     """
     mean, P = mass.moments()
+    P = without_chance(P, mass.effective)
     # An angle that goes around has an axis of its own; noise between it and the others is left out.
     B, D, free = np.eye(len(mean)), np.diag(np.zeros(len(mean)) if noise is None else np.diag(noise)), np.flatnonzero(~closed)
     if len(free):

@@ -17,6 +17,7 @@ from zakai.numerics.trains.train import Train
 
 FEW = 30.0  # effective points of the prediction that a likelihood must leave, or powers of it are taken
 MOST_POWERS = 8
+DEPTH_POINTS = 128
 ROUGHLY = 0.01  # relative error that densities between powers of a likelihood need: they only show where the mass is
 OFF_CENTRE, NARROW, WIDE = 0.5, 0.6, 1.6  # shift and deviation of a density in its frame, from which it gets another frame
 
@@ -107,6 +108,8 @@ def _power(mass: Mass, logs: Array) -> float:
 
 
 def depth_of(u: Carried, mass: Mass, posterior: Train) -> float:
-    """Return log(max u / u at the posterior mean) of a prediction u of which points are known."""
-    values = u(np.concatenate([posterior.moments()[0][:, None], mass.points], axis=1))
-    return float(math.log(max(values[1:].max(), 1e-300)) - math.log(max(values[0], 1e-300)))
+    """Return log(max u / u where the posterior is) of a prediction u of which points are known: zero for two equal Gaussians."""
+    points, weights = posterior.cloud(DEPTH_POINTS)
+    values = np.maximum(u(np.concatenate([points, mass.points], axis=1)), 1e-300)
+    count, n = len(weights), len(points)
+    return float(math.log(values[count:].max()) - weights @ np.log(values[:count]) - 0.5 * n)

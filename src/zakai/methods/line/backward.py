@@ -26,12 +26,12 @@ from zakai.methods.line.paths import draw
 from zakai.methods.line.prepared import Parts, Prepared, State, cut
 from zakai.methods.line.update import acting_inside, factor_of, state_moments, state_of
 from zakai.numerics.line import window as lw
+from zakai.numerics.line.backward import SMALLEST
 from zakai.numerics.line.density import support
 
 Array = Any
 
 KINKED = 16.0  # points of a likelihood with kinks in the spacing that a message needs
-SMALLEST = 1e-13  # value of a smoothed density relative to its maximum that is not rounding
 
 
 def message(prepared: Prepared, state: State) -> Message:

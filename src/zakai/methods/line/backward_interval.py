@@ -17,12 +17,12 @@ from zakai.methods.line.coefficients import covariance_at, resolved_parts
 from zakai.methods.line.domain import ends_of_leak
 from zakai.methods.line.gauged import by_fixed_grids, by_moving_grid
 from zakai.methods.line.kernel import kernel_of
-from zakai.methods.line.message import FEWEST, Message, covering, gauged, points_of, reliable, taper
+from zakai.methods.line.message import MOST_GRIDS, Message, covering, gauged, points_of, reliable, taper
 from zakai.methods.line.prepared import Prepared, State, TimeInterval
 from zakai.methods.line.transition import MOST_SUBSTEPS, Report, Substep, parts_of_split, travel, trial_substep
 from zakai.methods.line.volumes import WIDENINGS, cell_plan_of, ends_of, pulled_back
 from zakai.numerics.line import window as lw
-from zakai.numerics.line.backward import EXCURSION
+from zakai.numerics.line.backward import EXCURSION, FEWEST, ROUNDING
 from zakai.numerics.line.density import support
 from zakai.numerics.line.window import local_polynomial
 
@@ -82,11 +82,9 @@ def _transposed(
     return values, top, error
 
 
-ROUNDING = 1e-15  # of the maximum: smaller values of psi are not kept
 RESOLVED = 0.25  # spacing in standard deviations of the noise
 WIDTH = 0.8  # spacing in standard deviations of a Gaussian kernel at which sums are integrals
 MOST_POINTS = 4000  # of such sums
-MOST_GRIDS = 7  # of finer and finer spacing, for a decomposition
 SHARE = 1e-2  # of the tolerance that rounding in psi may leave
 
 

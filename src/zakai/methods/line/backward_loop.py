@@ -27,7 +27,7 @@ from zakai.numerics.line.steps import SPLIT, SPLIT_FACTOR
 Array = Any
 
 STRIDES = (1, 2, 4)  # points of psi in a spacing of the filter's grid
-MOST = 64  # intervals that are taken together
+MOST = 64  # intervals that one call filters
 APART = 32  # the ends of a grid for a decomposition are multiples of so many spacings
 
 
@@ -107,7 +107,7 @@ def _on_one_grid(
     prepared: Prepared, here: slice, before: Sequence[State], later: Message, smoothed: tuple[Array, lw.Window],
     window: lw.Window, stride: int, observed: Array,
 ) -> BackwardSegment | None:  # fmt: skip
-    """Return the message before intervals, moved on one grid, None where none is taken."""
+    """Return the message before intervals, on one grid, None where none is accurate."""
     limits = lb.Limits(smoothing_tolerance(prepared), SHARE * prepared.tolerance, negligible(prepared), prepared.cut)
     now, start, longer, gauge = lw.resampled(*smoothed, window), 0, window, np.zeros(1)
     filtered, centres = _before(before, window)
@@ -178,7 +178,7 @@ def _shared(state: State, after: lw.Window, later: Message, product: Array, grid
     for window in sorted({own, after}, key=lambda window: window.spacing, reverse=True):
         if _holds(window, low, high):
             on_it = lw.resampled(product, grid, window)
-            whole = abs(float(np.sum(on_it)) - 1.0) <= lb.UNRESOLVED  # or it stands between the points
+            whole = abs(float(np.sum(on_it)) - 1.0) <= lb.UNRESOLVED  # or it lies between the points
             result += [window] if whole and lw.grid_check(on_it, window.closed).aliasing <= lb.UNRESOLVED else []
     return result
 

@@ -28,7 +28,7 @@ Array = Any
 
 @dataclass
 class Density:
-    """A density before an interval that is taken alone: its values (N,) and their grid.
+    """A density before an interval that is filtered alone: its values (N,) and their grid.
 
     `kernel` is the Gaussian kernel of the interval, None where there is none; `travel` by how many of its ranges the drift moves
     the density.
@@ -141,7 +141,7 @@ MECHANISMS = (
 def predicted(
     prepared: Prepared, values: Array, window: lw.Window, interval: TimeInterval, report: Report
 ) -> tuple[Prediction, float]:
-    """Return the density after an interval that is taken alone, and the factor by which its kernel contracts deviations."""
+    """Return the density after an interval that is filtered alone, and the factor by which its kernel contracts deviations."""
     kernel = kernel_of(prepared, interval, window, report)
     density = Density(prepared, values, window, interval, report, kernel)
     for mechanism in MECHANISMS:

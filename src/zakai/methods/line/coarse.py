@@ -15,17 +15,17 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zakai.methods.line.coefficients import EDGE, covariance_at, gauge_at, spectral
+from zakai.methods.line.coefficients import covariance_at, gauge_at, spectral
 from zakai.methods.line.prepared import Prepared
 from zakai.methods.line.update import grid_check
 from zakai.numerics.line import window as lw
+from zakai.numerics.line.grid_choice import SPACING
+from zakai.numerics.line.window import EDGE
 
 Array = Any
 
-SPACING = 0.34  # spacing in standard deviations of the noise, at most: the shortest wave decays by exp(-42)
 SHARP = 2.0  # how much finer a grid is at least
-REACH = 7.2  # standard deviations of the noise by which the support grows
-MARGIN = 7.2  # of them beyond: the waves that R' leaves everywhere end there, and spread from the ends
+MARGIN = 7.2  # standard deviations of the noise by which the support grows, and beyond which waves that R' leaves end
 TRIALS = 6
 
 
@@ -56,7 +56,7 @@ def coarsened(prepared: Prepared, values: Array, window: lw.Window, length: floa
         return None
     spacing = window.unit * 2.0 ** np.floor(np.log2(SPACING * deviation / window.unit) + 1e-9)
     wide = float(np.sqrt(np.max(covariance.real) * length))
-    low, high = window.offsets[check.first] - REACH * wide, window.offsets[check.last] + REACH * wide
+    low, high = window.offsets[check.first] - MARGIN * wide, window.offsets[check.last] + MARGIN * wide
     allowed = 1e-5 * prepared.tolerance
     for _ in range(TRIALS):
         coarse = _grid(window, float(low - MARGIN * wide), float(high + MARGIN * wide), float(spacing))

@@ -26,8 +26,6 @@ from zakai.numerics.line.product import PARTS, at_nodes, nodes, weak
 
 Array = Any
 
-EDGE = 1e-11  # density at the outermost points of a grid, relative to the maximum
-
 _MIDPOINTS = (np.arange(32) + 0.5) / 32.0 - 0.5
 
 

@@ -31,7 +31,7 @@ import sympy as sp
 
 from zakai.densities.mapped import IntervalMap
 from zakai.errors import InputError
-from zakai.methods.line.coefficients import EDGE, covariance_at
+from zakai.methods.line.coefficients import covariance_at
 from zakai.methods.line.prepared import Prepared
 from zakai.methods.system.escape import Density, Motion, check_one_state, divisors_of
 from zakai.models.domain import Interval
@@ -39,6 +39,7 @@ from zakai.models.kept import kept, once_for_a_model
 from zakai.models.model import Model
 from zakai.models.numeric import numpy_function
 from zakai.numerics.line import window as lw
+from zakai.numerics.line.window import EDGE
 
 Array = Any
 

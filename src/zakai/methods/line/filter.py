@@ -46,14 +46,14 @@ from zakai.models.model import Model
 from zakai.numerics.line import window as lw
 from zakai.numerics.line.density import separated
 from zakai.numerics.line.product import General, multiplied
-from zakai.numerics.line.steps import RELIABLE
+from zakai.numerics.line.steps import RELIABLE, error_made
 from zakai.records.schedule import Schedule
 
 Array = Any
 
 SLOW = 1e-2  # of the tolerance: the spectrum that need not be resolved where f has kinks
-SLOW_GENEROUS = 256  # points of a grid that is kept though fewer would do
-GENEROUS = 96  # points of a grid that is kept though fewer would do
+SLOW_GENEROUS = 256  # points of a grid that is retained though fewer would do
+GENEROUS = 96  # points of a grid that is retained though fewer would do
 PILED = 0.5  # density at an end of the grid, relative to the maximum, of a product that is cut off there
 
 
@@ -82,7 +82,7 @@ def step(prepared: Prepared, k: int, state: State, observed: np.ndarray) -> tupl
         product = loop.one(prepared, k, state, observed)
         if product is not None:
             return product
-    # Attempts that overflow are taken again in shorter substeps.
+    # A substep that overflows is repeated in shorter ones.
     with np.errstate(all="ignore"):
         stepped = single(prepared, k, state, observed)
     return stepped.state, stepped.info
@@ -201,15 +201,14 @@ def single(prepared: Prepared, k: int, state: State, observed: np.ndarray) -> Si
         report.density(check)
     elif check is None or prepared.kinked:
         check = grid_check(prepared, values, window)
-    # A large grid is kept only where its decomposition serves the next intervals too.
+    # A large grid is retained only where its decomposition serves the next intervals too.
     generous = prepared.generous if report.decomposed else min(prepared.generous, GENEROUS)
     new_values, new, coarse = on_fitting_grid(prepared, values, window, check, generous)
     if new != window and not prepared.weak:  # the largest grid may be too coarse for all that the density has
         report.aliasing = max(report.aliasing, coarse)
     mean, variance = lw.moments(values, window)
     report.edge = max(report.edge, edge_of_moments(prepared, values, window))
-    made = 2.0 * report.aliasing + 10.0 * report.edge + report.time + 10.0 * report.negative
-    made += min(floor * report.growth, 1.0)
+    made = error_made(report.aliasing, report.edge, report.negative, report.time, floor * report.growth)
     retained = error_remainder(before[1], mean_and_variance[1], variance, spread(prepared, k, length, window.origin + mean.real))
     error = made + state.error * (1.0 if separated(np.ascontiguousarray(values.real)) else retained)
     error = max(error, RELIABLE * prepared.promised)

@@ -19,7 +19,7 @@ import numpy as np
 from scipy.special import expit
 
 from zakai.methods.line.coefficients import coefficients, covariance_at, resolved_parts
-from zakai.methods.line.message import FEWEST, Message, reliable
+from zakai.methods.line.message import MOST_GRIDS, Message, reliable
 from zakai.methods.line.model import finite
 from zakai.methods.line.prepared import Prepared, State, TimeInterval
 from zakai.methods.line.transition import (
@@ -34,11 +34,11 @@ from zakai.methods.line.transition import (
 )
 from zakai.methods.line.update import state_of
 from zakai.numerics.line import window as lw
+from zakai.numerics.line.backward import FEWEST, ROUNDING
 from zakai.numerics.line.density import support
 
 Array = Any
 
-ROUNDING = 1e-15  # of the maximum: the error of psi by rounding
 DEGREE = 8  # of the polynomial l that follows a density
 DEPTH = -20.0  # logarithm of the density, relative to its maximum, beyond which l is linear
 BLEND = 3.0  # spacings over which it becomes linear
@@ -147,8 +147,7 @@ def _logarithms(density: Array, z: Array) -> Array:
 WIDTH = 8.8  # standard deviations of psi from its mean to the ends of a grid
 MARGIN = 1.2  # of a wider grid
 ROUGH = 1e-3  # of the tolerance that noise of psi may leave
-MOST_GRIDS = 7  # that are finer or wider
-STANDS = 1.0  # deviations by which a message may move and change its width on a grid that stands
+FIXED = 1.0  # deviations by which a message may move and change its width on a fixed grid
 BEYOND = 1.3  # length of such a grid, in ranges of the product
 MOST_PARTS = 16  # of an interval
 NOISE = -32.0  # logarithm of the error of small values of a density within an interval, relative to the largest
@@ -172,7 +171,7 @@ def by_moving_grid(
 def by_fixed_grids(
     prepared: Prepared, interval: TimeInterval, state: State, later: Message, accepted: float
 ) -> tuple[Message, float] | None:
-    """Return the same by grids that stand, each for a part of the interval in which the density changes by little."""
+    """Return the same by fixed grids, each for a part of the interval in which the density changes by little."""
     length = interval.length
     count = _parts(prepared, later, interval.start + length, length)
     while count <= MOST_PARTS:
@@ -202,20 +201,20 @@ def _states(prepared: Prepared, interval: TimeInterval, cuts: list[float], state
 
 def _over_part(
     prepared: Prepared, interval: TimeInterval, part: tuple[float, float], state: State, later: Message, accepted: float,
-    stands: bool,
+    is_fixed: bool,
 ) -> tuple[Message, float] | None:  # fmt: skip
     """Return the message at the start of a part of an interval, and the error that it adds; None where this does not serve."""
     spacing, error, noise, scaled = later.needed, 0.0, 0.0, later.scaled
     now, begin, centre, deviation, reach = None, later, later.mean, later.deviation, WIDTH * later.deviation
-    if stands:  # the ends of the product
+    if is_fixed:  # the ends of the product
         centre, reach = 0.5 * (later.ends[0] + later.ends[1]), 0.5 * BEYOND * (later.ends[1] - later.ends[0])
     stack, count, tried = [part], 0, 0
     while stack:
         first, last = stack.pop()
         if now is None:
-            if not stands:
+            if not is_fixed:
                 reach = WIDTH * deviation
-            now = placed(begin, centre, deviation, spacing, reach * MARGIN ** (tried // 2), state if stands else None)
+            now = placed(begin, centre, deviation, spacing, reach * MARGIN ** (tried // 2), state if is_fixed else None)
             if now is None or tried > MOST_GRIDS:
                 return None
             now = now._replace(scaled=scaled)
@@ -223,7 +222,7 @@ def _over_part(
                 stack, error = resolved_parts(prepared, now.values, now.window, interval.part(*part))
                 stack = [(part[0] + low, part[0] + high) for low, high in stack]
                 first, last = stack.pop()
-        trial, propagated = _substep(prepared, now, interval.part(first, last), stands)
+        trial, propagated = _substep(prepared, now, interval.part(first, last), is_fixed)
         count += 1
         if trial.split:
             if count + len(stack) >= MOST_SUBSTEPS or not np.isfinite(trial.error):
@@ -235,14 +234,14 @@ def _over_part(
         if made <= min(accepted * 10.0**tried if not check.rough else 1.0, ROUGH * prepared.tolerance):
             error, noise, now, tried = error + trial.error, max(noise, made), propagated, 0
             continue
-        # Another grid about psi as it is, then wider and finer ones.
+        # Take another grid about psi, then wider and finer ones.
         stack.append((first, last))
         if tried == 0:
             spacing = now.window.spacing
             if last < part[1]:
                 begin, error = now.message(later.error, *now.reliable()), error + float(np.sum(np.abs(now.values.imag)))
             mean, variance = lw.moments(now.values.real, now.window)
-            centre, deviation = centre if stands else float(mean), float(np.sqrt(variance))
+            centre, deviation = centre if is_fixed else float(mean), float(np.sqrt(variance))
         tried, scaled = tried + 1, now.scaled
         if tried % 2 and check.aliasing > accepted:
             spacing /= 1.4
@@ -275,10 +274,10 @@ def _reliable_message(now: Psi, state: State, before: float, noise: float, error
 
 
 def _parts(prepared: Prepared, later: Message, time: float, length: float) -> int:
-    """Return in how many parts grids stand while an interval that ends at a time is taken back."""
+    """Return in how many parts an interval that ends at a time has fixed grids."""
     variance = later.deviation**2
     speed, _, growth = _flow(prepared, later.origin + later.mean, 0.1 * later.deviation, variance, time, length)
-    count = length * (abs(speed) / later.deviation + abs(growth)) / STANDS
+    count = length * (abs(speed) / later.deviation + abs(growth)) / FIXED
     return max(int(np.ceil(count)), 1) if count <= MOST_PARTS else MOST_PARTS + 1  # NaN too
 
 
@@ -292,7 +291,7 @@ def _flow(prepared: Prepared, x: float, apart: float, variance: float, time: flo
 
 
 def _substep(
-    prepared: Prepared, later: Psi, interval: TimeInterval, stands: bool
+    prepared: Prepared, later: Psi, interval: TimeInterval, is_fixed: bool
 ) -> tuple[Trial, Psi]:
     """Return psi before an interval."""
     window, points = later.window, lw.index(later.window.size)
@@ -300,7 +299,7 @@ def _substep(
     variance = float(lw.moments(later.values.real, window)[1])
     speed, slope, growth = _flow(prepared, window.origin + window.centre, spacing, variance, start + length, length)
     scaled = later.scaled * float(np.exp(-slope * length))
-    if stands:
+    if is_fixed:
         speed, slope, growth = 0.0, 0.0, 0.0
 
     def place(times: Array) -> tuple[Array, Array, Array]:
@@ -321,7 +320,7 @@ def _substep(
 
     by, _, s = place(np.array([-length]))
     unit = lw.Window(0.0, 0.0, 1.0, window.size, False, 1.0)
-    trial = magnus(prepared, later.values, unit, Substep(start, length, inside, rates), at, True, not stands)
+    trial = magnus(prepared, later.values, unit, Substep(start, length, inside, rates), at, True, not is_fixed)
     total = float(np.sum(trial.values.real))
     before = window._replace(centre=window.centre + float(by[0]), spacing=spacing * float(s[0]))
     scale = later.scale + float(trial.offset) + float(np.log(total))

@@ -13,7 +13,7 @@ from zakai.numerics.line.gaussian_kernels import WIDE, Channel, applied, around,
 
 Array = Any
 
-SAME_SPACING = 160  # points up to which the spacing of a grid is kept where it is enlarged
+SAME_SPACING = 160  # points up to which the spacing of a grid is retained where it is enlarged
 NARROWEST = 1.4  # spacings that the standard deviation of a kernel must have
 MOST_GRIDS = 13
 
@@ -75,7 +75,7 @@ def _along(
         check, left, right, coarse = lw.grid_check(result, False, negligible, cut), True, True, False
         if result.any():
             left, right = check.left > 10 * cut, check.right > 10 * cut
-            coarse = check.aliasing > 30.0 * negligible and (check.aliasing > rough or not check.rough)
+            coarse = check.unresolved(negligible, rough)
         if not (left or right or coarse):
             mass = np.sum(result)
             return Prediction(result / mass, new, np.log(mass) + top + best, check)

@@ -14,6 +14,7 @@ import numpy as np
 from zakai.methods.line.coefficients import decomposed
 from zakai.methods.line.prepared import Derived, Prepared, State
 from zakai.numerics.line import window as lw
+from zakai.numerics.line.backward import FEWEST
 from zakai.numerics.line.operator import Spectral
 from zakai.numerics.line.window import local_polynomial
 
@@ -21,8 +22,8 @@ Array = Any
 
 FALL = 3.3  # spacings over which F falls
 HALF = 14.0  # spacings from where F is one to where it is one half
+MOST_GRIDS = 7  # that are tried, finer and finer or wider
 PAD = 28  # spacings over which F falls to zero
-FEWEST = 12  # points of a message
 FEW = 16  # larger grids have a multiple of so many points: few different sizes
 SURE = 10.0  # errors of a density from which its small values count
 LOWEST = -30.0  # logarithm of the largest error of small values, relative to the largest value

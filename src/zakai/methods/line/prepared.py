@@ -36,7 +36,7 @@ NOISE = 3e-15  # error of a density relative to its maximum, which matters in it
 KERNEL_SHARE = 2e-2  # of the promised error that the splitting of one interval may leave in `limited-direct`
 SHARE = 5e-3  # of the tolerance that the splitting of one interval may leave
 SHARED = 128  # points of the largest grid on which many steps share a decomposition
-CACHE_BYTES = 96 * 2**20  # of tables and decompositions of grids, which are kept for a model
+CACHE_BYTES = 96 * 2**20  # of tables and decompositions of grids, which are stored for a model
 
 
 @lru_cache(maxsize=8)
@@ -60,6 +60,7 @@ class Derived(Enum):
     HIDDEN_DRIFT = "the error of f between the points of a grid"
     PRECISION = "the inverse of S for some coordinates"
     SAMPLE_NOISE = "the inverse of S of a sample, and the constant of its density"
+    ONE_PRECISION = "the inverse of a constant S of what is seen in one interval, and the constant of its likelihood"
     STEADY = "a coefficient that depends neither on x nor on t"
     KINKS = "the states between two at which coefficients have kinks"
 
@@ -358,11 +359,12 @@ def coefficients_of(prepared: Prepared) -> Coefficients:
 
     def everywhere(function: Callable[..., np.ndarray], name: str | None) -> np.ndarray:
         """Return a function of time alone at all times; one that is constant has a name."""
-        if name:
-            result = prepared.once(Derived.STEADY, name, lambda: function(_X, np.full((1, 1), prepared.model.start), theta))
-        else:
-            result = function(_X, t, theta)
-        return np.broadcast_to(result, (*t.shape, *result.shape[2:]))
+        if name is None:
+            return function(_X, t, theta)
+        value = prepared.once(Derived.STEADY, name, lambda: function(_X, np.full((1, 1), prepared.model.start), theta))
+        result = np.empty((*t.shape, *value.shape[2:]), value.dtype)
+        result[...] = value
+        return result
 
     def precision(noise: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         if system.general:  # the loop takes only intervals without observations
@@ -383,7 +385,10 @@ def coefficients_of(prepared: Prepared) -> Coefficients:
     if prepared.divides:
         G = everywhere(system.covariance, "G" if system.steady_covariance else None)[..., 0, 0]
     noise = everywhere(system.noise, "S" if system.steady_noise else None)
-    precisions, constants = precision(noise[:, ends])
+    if count == 1 and system.steady_noise:  # one interval of an online filter
+        precisions, constants = prepared.once(Derived.ONE_PRECISION, seen.tobytes(), lambda: precision(noise[:, ends]))
+    else:
+        precisions, constants = precision(noise[:, ends])
     parts = np.ones(count, int)
     if resolved and prepared.timed:
         parts = np.isfinite(factors).all(axis=(1, 2)).astype(int)

@@ -18,7 +18,6 @@ import numpy as np
 
 from zakai.methods.line.coarse import coarsened
 from zakai.methods.line.coefficients import (
-    EDGE,
     GROWTH,
     coefficients,
     covariance_at,
@@ -39,6 +38,7 @@ from zakai.numerics.line.averages import GAUSS_NODES, GAUSS_WEIGHTS
 from zakai.numerics.line.grid_choice import REACH
 from zakai.numerics.line.operator import FourierOperator, exponential_of
 from zakai.numerics.line.product import finer
+from zakai.numerics.line.window import EDGE
 
 Array = Any
 
@@ -285,7 +285,7 @@ def by_modes(prepared: Prepared, values: Array, window: lw.Window, length: float
 
 
 MOST_SUBSTEPS = 4000
-FEW = 24  # substeps of an interval, after which no large grid is taken
+FEW = 24  # substeps of an interval, after which no large grid is used
 
 
 class Report:
@@ -321,7 +321,7 @@ class RecordedTransition(NamedTuple):
 
 
 class Prediction(NamedTuple):
-    """The density after an interval, its grid, the logarithm of its mass, its figures, and how it was moved, where known."""
+    """The density after an interval, its grid, the logarithm of its mass, its grid check, and the transitions, where known."""
 
     values: Array
     window: lw.Window
@@ -343,7 +343,7 @@ def by_decomposition(prepared: Prepared, values: Array, window: lw.Window, lengt
         if result is None or not lost(float(np.sum(result[0].real))) < 1e-3:
             return None
         check = lw.grid_check(result[0], window.closed, negligible)
-        if check.aliasing > 30.0 * negligible and (check.aliasing > rough or not check.rough):
+        if check.unresolved(negligible, rough):
             return None
         bound = max(EDGE, 4.0 * check.aliasing)
         left, right = check.left > bound, check.right > bound
@@ -371,7 +371,7 @@ def by_substeps(
     report: Report,
     moving: bool = False,
 ) -> Prediction:
-    """Return the density after an interval, by exponentials of its operator, on grids that move with it or stand."""
+    """Return the density after an interval, by exponentials of its operator, on grids that move with it or are fixed."""
     result, tails = _by_substeps(prepared, values, window, interval, report, moving)
     if NOISE * np.exp(min(tails, 690.0)) > 0.1 * prepared.tolerance:
         # Increments far from the density may multiply rounding errors in its tails: compare with a density that has more of them.
@@ -422,7 +422,7 @@ def _by_substeps(
             if split:
                 break
             check = lw.grid_check(trial.values, window.closed, negligible)
-            coarse = check.aliasing > resolved and (check.aliasing > rough or not check.rough)
+            coarse = check.unresolved(negligible, rough)
             coarse = coarse and (not prepared.weak or known <= resolved)  # a finer grid has no more of the spectrum of a kink
             bound = max(EDGE, 4.0 * check.aliasing)
             left, right = check.left > bound, check.right > bound

@@ -233,7 +233,7 @@ def sampled_weakly(
 
 
 def _finer(prepared: Prepared, values: Array, window: lw.Window) -> tuple[lw.Window, bool]:
-    """Return a finer grid for a density, and whether that holds it with the margins that a grid is kept with."""
+    """Return a finer grid for a density, and whether that holds it with the margins of a grid that is retained."""
     check = grid_check(prepared, values, window)
     low, high = window.offsets[check.first], window.offsets[check.last]
     new = lw.quantized(window, low, high, window.spacing / 2**0.5 * 1.001, margin=0.16, most=lw.SIZES[-1])

@@ -39,10 +39,10 @@ _FLOW_STEPS = 32
 
 
 class CellPlan(NamedTuple):
-    """How an interval moves a density, the cells that hold it all the way, the first step, and the fastest drift that counts.
+    """How an interval moves a density, the cells that hold it throughout, the first step, and the fastest drift that counts.
 
     `last` is the step with which a message that is sharp at the end begins.  Between two `bounds` (B + 1,) the coefficients are
-    polynomials of time, up to the relative error `unresolved`; `share` is that of the steps of `LEVELS` that are taken.
+    polynomials of time, up to the relative error `unresolved`; `share` is that of the steps of `LEVELS` that are used.
     """
 
     flow: FlowSummary
@@ -219,7 +219,7 @@ NARROWEST = 40.0  # range of a density in cells
 SHARE = 0.1  # of the tolerance that volumes may leave
 ROUNDING = 4e-16  # error of the exponential of an operator, relative to its norm
 WIDENINGS = 0.5, 2.0  # ranges of a density by which it grows on each side, where that error is too large
-SMOOTH = 1e-7  # error of a backward interval at which more cells are not taken
+SMOOTH = 1e-7  # error of a backward interval at which more cells are not tried
 
 
 def rough(prepared: Prepared, inside: np.ndarray) -> bool:
@@ -309,7 +309,7 @@ def advanced_by(
         density: the density before, as a function of offsets (J,).
         plan: the plan of the cells.
         interval: the interval.
-        allowed: the error at which more cells are not taken.
+        allowed: the error at which more cells are not tried.
     """
 
     def at_level(cells: Volumes, steps: Array) -> tuple[Array, Any]:
@@ -382,7 +382,7 @@ def _settled(
     """Return the values of cells, with more cells until they settle.
 
     Args:
-        allowed: the error at which more cells are not taken.
+        allowed: the error at which more cells are not tried.
         at_level: values of the sum one on cells and the logarithm of their scale, for the ends of steps.
         paired: values on half as many cells.
         weights: those of the errors of cells.

@@ -11,12 +11,13 @@ one piece, leave a smaller error.  This is decided at the first interval.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from zakai.densities import ConditionalParticleDensity, ParticleDensity
-from zakai.methods._protocol import Backward, Info, through
+from zakai.methods._protocol import Backward, Info
 from zakai.methods.particles import filter as particle_filter
 from zakai.methods.particles.backward import BACKWARD as PLAIN_BACKWARD
 from zakai.methods.particles.conditional import ConditionalSystem, covariances
@@ -83,7 +84,8 @@ def drawn(prepared: Prepared, state: State) -> State:
     particles = state.particles[:n].copy()
     particles[list(system.block.linear)] += np.einsum("pij,pj,jp->ip", vectors, np.sqrt(np.maximum(values, 0.0)), noise)
     reduced = particle_filter.reduced(state)
-    return reduced._replace(particles=particles, shift=state.shift[:n], last_shift=state.last_shift[:n])
+    known = {"shift": state.shift[:n], "last_shift": state.last_shift[:n], "last_scale": state.last_scale[:n]}
+    return reduced._replace(particles=particles, **known)
 
 
 def density(prepared: Prepared, state: State) -> ParticleDensity | ConditionalParticleDensity:
@@ -102,8 +104,4 @@ def valid(prepared: Prepared, state: State) -> bool:
     return len(state.particles) in (prepared.system.n, prepared.model.n) and valid_state(suited(prepared, state), state)
 
 
-BACKWARD: Backward[Prepared, State, Any] = through(
-    lambda prepared: (PLAIN_BACKWARD, prepared.plain),
-    lambda prepared, state: drawn(suited(prepared, state), state),
-    lambda prepared, state, health: health,
-)
+BACKWARD: Backward[Prepared, State, Any] = replace(PLAIN_BACKWARD, options={"split": False})

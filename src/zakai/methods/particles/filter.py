@@ -65,6 +65,7 @@ VARIANCE = 5.0  # that of a mean times N, in variances of the state, that the nu
 MOST_GROWTH = 4
 # Share of the allowed time error below which its measurement is trusted in so many more intervals, if it is certain or not, and
 # the ratio of the errors of two lengths up to which that holds.
+REPEATED, NARROWEST = 2.0, 0.02  # excess of the time error at which an interval is repeated, and least narrowing that counts
 SURE, TRUSTED, TRUSTED_LESS, LONGER = 0.5, 8, 2, 4.0
 
 
@@ -91,8 +92,8 @@ def _at_start(prepared: Prepared, particles: Array, first: Array, gaussian: tupl
     width = system.law.width if system.law is not None else system.factor.width  # type: ignore[union-attr]
     window = Window.begin(particles, first, gaussian, (width, len(prepared.motion.law[3])))
     logs, nothing = np.full(count, -np.log(count)), np.zeros(system.n)
-    control = Control(0, 0.0, 4, 0.0, 0.0, 0, VARIANCE, 0, 0.0, 0.0, 0, 0.0)
-    return State(particles, logs, window, Genealogy.begin(count), control, nothing, nothing)
+    control = Control(0, 0.0, 4, 0.0, 0.0, 0, 1.0, VARIANCE, 0, 0.0, 0.0, 0, 0.0)
+    return State(particles, logs, window, Genealogy.begin(count), control, nothing, nothing, np.ones(system.n))
 
 
 def reduced(state: State) -> State:
@@ -153,15 +154,16 @@ class Cloud(NamedTuple):
 class Advanced(NamedTuple):
     """Particles after an interval, with what was needed.
 
-    `gained` is the increment of the log-likelihood, `noise` (D, N) that of the interval, `predicted` (n,) the standard deviations
-    before the observation, `acceptance` that of moves between powers of the likelihood, `lost` the share of the particles that
-    left every bounded set.
+    `gained` is the increment of the log-likelihood, `noise` (D, N) that of the interval, `predicted` (n',) the spread of the
+    coordinates before the weights of the observation act, `deviations` (n,) those of the states before it, `acceptance` that of
+    moves between powers of the likelihood, `lost` the share of the particles that left every bounded set.
     """
 
     cloud: Cloud
     gained: float
     noise: Array
     predicted: Array
+    deviations: Array
     levels: int = 0
     guided: bool = False
     acceptance: float = np.nan
@@ -199,18 +201,27 @@ def _step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[Stat
     weights = np.exp(cloud.logs)
     before, _, cov, _ = _moments(system, cloud.particles, weights)
     scale = np.maximum(system.scales(cov), 1e-12)
-    steps, control = _steps(prepared, interval, values, state, (before, scale))
-    events = motion.events(interval, steps.scheme, values, before, scale)
     observed = _observed(prepared, interval, values)
-    events = with_update(events, system, observed)
     wanted = _wanted(rule, len(weights), control.variance)
     if effective(weights) < RESAMPLE_BELOW * len(weights) or wanted != len(weights):
         cloud, _ = cloud.resampled(weights, wanted, prepared.key(number, RESAMPLING))
-    done = _advanced(prepared, cloud, events, observed, number)
+    start, narrow = cloud, control.narrow
+    for last_turn in (False, True):
+        # Errors are measured in deviations after the observation, by how much the last one, or this one, has narrowed them.
+        steps, control = _steps(prepared, interval, values, state, (before, narrow * scale))
+        events = with_update(motion.events(interval, steps.scheme, values, before, scale), system, observed)
+        done = _advanced(prepared, start, events, observed, number)
+        found_narrow = _narrowing(system, done)
+        if last_turn or steps.error * narrow <= REPEATED * TIME_ERROR * found_narrow:
+            break
+        narrow = found_narrow
+    measured = state.last_scale if steps.shift is state.last_shift else narrow * scale
     if done.lost > 0.5 * RARE:
         check_escape(prepared, k, at_start)
     cloud = done.cloud
-    cloud = cloud._replace(window=cloud.window.appended(motion, events, observed, done.noise, cloud.particles))
+    # Of many coordinates the states at the end are not kept: an interval is run again when it leaves the window.
+    end = cloud.particles if system.n <= 2 * n else np.zeros((0, 0))
+    cloud = cloud._replace(window=cloud.window.appended(motion, events, observed, done.noise, end))
     weights = np.exp(cloud.logs)
     size, largest = effective(weights), float(weights.max())
     mean, deviations, cov, own = _moments(system, cloud.particles, weights)
@@ -235,8 +246,8 @@ def _step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[Stat
     contraction = np.where(done.predicted > 0, np.minimum(1.0, own / np.maximum(done.predicted, 1e-300)) ** 2, 1.0)
     shift = _carried(motion, events, before, state.shift) + steps.shift
     # A shifted prediction changes the log density of an observation by the shift times an innovation.
-    known = np.maximum(spread**2 + done.predicted[:n] ** 2 - own[:n] ** 2, 1e-300)
-    shifted = control.shifted + float((shift[:n] ** 2 / known * (1.0 - contraction[:n])).max())
+    known = np.maximum(done.deviations, 1e-300)
+    shifted = control.shifted + float(((shift[:n] / known) ** 2 * (1.0 - contraction[:n])).max())
     shift = shift * contraction
     genealogy, evidence = of_log_likelihood(cloud.genealogy, found)
     cloud, evidence = cloud._replace(genealogy=genealogy), evidence + shifted
@@ -261,9 +272,10 @@ def _step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[Stat
     info = Info(done.gained, mean[:n], cov, health, np.sqrt(found.largest + shift[:n] ** 2), float(np.sqrt(evidence)))
     variance = 0.8 * control.variance + 0.2 * len(weights) * float(share.mean())
     control = control._replace(
-        interval=number, variance=variance, last=last, urgency=urgency, floor=floor, doubtful_until=until, shifted=shifted
-    )
-    return State(cloud.particles, cloud.logs, cloud.window, cloud.genealogy, control, shift, steps.shift), info
+        interval=number, narrow=found_narrow, variance=variance, last=last, urgency=urgency, floor=floor, doubtful_until=until,
+        shifted=shifted,
+    )  # fmt: skip
+    return State(cloud.particles, cloud.logs, cloud.window, cloud.genealogy, control, shift, steps.shift, measured), info
 
 
 def _steps(
@@ -275,8 +287,9 @@ def _steps(
     guess = min(max(1, round(control.substeps * length)), MOST_SUBSTEPS)
     if length <= 0:
         return Steps(Scheme(1, 4), np.zeros(len(mean)), 0.0, 0.0), control
-    # The error of an interval is of the third order of its length.
+    # The error of an interval is of the third order of its length, and was measured in deviations of that time.
     ratio = (length / control.length) ** 3 if control.trusted else np.inf
+    ratio *= max(1.0, float((state.last_scale / scale).max()))
     if ratio <= LONGER and control.error * ratio <= SURE * TIME_ERROR:
         known = Steps(Scheme(guess, control.stages), state.last_shift, control.error, control.error)
         return known, control._replace(trusted=control.trusted - 1)
@@ -332,14 +345,17 @@ def _advanced(prepared: Prepared, cloud: Cloud, events: Events, observed: Observ
     if lost.any():
         particles[:, lost] = cloud.particles[:, lost]
         seen[:, lost] = cloud.particles[:, lost]
-    predicted = _moments(prepared.system, particles, np.exp(cloud.logs)).spread
+    weights = np.exp(cloud.logs)
+    moved = _moments(prepared.system, particles, weights)
+    before = moved if ends is None else _moments(prepared.system, seen, weights)
+    spreads = moved.spread, np.sqrt(np.maximum(np.diag(before.cov), 0.0))
     if prepared.system.sampled and not observed.counted.any() and not lost.any():
-        return Advanced(cloud._replace(particles=particles), 0.0, noise, predicted)
+        return Advanced(cloud._replace(particles=particles), 0.0, noise, *spreads)
     share = float(lost.mean())
     logs = gained + _log_likelihood(motion, seen, observed)
     logs[lost | np.isnan(logs)] = -np.inf
     weights, top = normalised(cloud.logs + logs)
-    plain = Advanced(cloud._replace(particles=particles, logs=cloud.logs + logs - top), top, noise, predicted, lost=share)
+    plain = Advanced(cloud._replace(particles=particles, logs=cloud.logs + logs - top), top, noise, *spreads, lost=share)
     if effective(weights) >= GUIDE_BELOW * count and np.isfinite(top):
         return plain
     moving = cloud.window.length == 0 and len(cloud.window.first) > 0
@@ -365,6 +381,14 @@ class Drawn(NamedTuple):
     path: Array
     logs: Array
     gaussian: Any
+
+
+def _narrowing(system: System, done: Advanced) -> float:
+    """Return the smallest ratio of the deviations of a state after and before the observation."""
+    cov = _moments(system, done.cloud.particles, np.exp(done.cloud.logs)).cov
+    wide = done.deviations > 0
+    ratios = np.sqrt(np.maximum(np.diag(cov), 0.0))[wide] / done.deviations[wide]
+    return float(np.clip(np.nanmin(ratios, initial=1.0), NARROWEST, 1.0))
 
 
 def _log_likelihood(motion: Motion, particles: Array, observed: Observed) -> Array:
@@ -428,7 +452,7 @@ def _tempered(prepared: Prepared, target: Target, cloud: Cloud, drawn: Drawn, nu
     window = cloud.window._replace(first=np.ascontiguousarray(path[:d0])) if moving else cloud.window
     after = Cloud(particles, cloud.logs, window, cloud.genealogy)
     noise, guided = np.ascontiguousarray(path[d0:]), fixed is not None
-    return Advanced(after, gained, noise, drawn.after.predicted, levels, guided, float(np.mean(rates)), drawn.after.lost)
+    return Advanced(after, gained, noise, *drawn.after[3:5], levels, guided, float(np.mean(rates)), drawn.after.lost)
 
 
 def _excess(variance: Array, cov: Array, count: int) -> float:

@@ -20,9 +20,10 @@ class Control(NamedTuple):
     """What decides the next step beside the particles.
 
     `interval` counts intervals; `substeps` per unit time with `stages`, whose `error` was measured in an interval of this
-    `length` and is trusted in so many more; `variance` of a mean times N, `last` intervals of the window at the last move,
-    `urgency` what has added up since then, `floor` what it has left, `doubtful_until` the number of resamplings until which
-    standard errors are lower bounds, and `shifted` the variance of the log-likelihood by the time step.
+    `length` and is trusted in so many more; `narrow` the ratio of the deviations after and before the last observation,
+    `variance` of a mean times N, `last` intervals of the window at the last move, `urgency` what has added up since then, `floor`
+    what it has left, `doubtful_until` the number of resamplings until which standard errors are lower bounds, and `shifted` the
+    variance of the log-likelihood by the time step.
     """
 
     interval: int
@@ -31,6 +32,7 @@ class Control(NamedTuple):
     error: float
     length: float
     trusted: int
+    narrow: float
     variance: float
     last: int
     urgency: float
@@ -43,7 +45,8 @@ class State(NamedTuple):
     """The weighted particles and what continues them.
 
     `particles` (n, N), `log_weights` (N,) that sum to one, the past, the ancestors, the controls, `shift` (n,), the error of the
-    mean by the time step, and `last_shift` (n,), that of the last interval in which it was measured.
+    mean by the time step, `last_shift` (n,), that of the last interval in which it was measured, and `last_scale` (n,), the
+    standard deviations in which it was measured.
     """
 
     particles: Array
@@ -53,6 +56,7 @@ class State(NamedTuple):
     control: Control
     shift: Array
     last_shift: Array
+    last_scale: Array
 
 
 @dataclass(frozen=True)

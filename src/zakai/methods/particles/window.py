@@ -105,9 +105,8 @@ class Window(NamedTuple):
             rest(self.ancestors, _EMPTY), rest(self.events, _NO_EVENTS), self.times[1:], self.given[1:], self.counted[1:],
         )  # fmt: skip
 
-    def path(self) -> tuple[Array, Array]:
-        """Return the noise (D, N) of the particles, and the states (n, N) at the start of the window."""
-        index: Array | None = None
+    def path(self, index: Array | None = None) -> tuple[Array, Array]:
+        """Return the noise (D, N) of the particles, or of some, and the states (n, N) at the start of the window."""
         parts = []
         for k in reversed(range(self.length)):
             ancestors = self.ancestors[k]
@@ -126,6 +125,27 @@ class Window(NamedTuple):
         ends = _with((none,) * INTERVALS, self.length - 1, end)
         first = np.ascontiguousarray(path[: len(self.first)])
         return self._replace(start=start, first=first, noises=tuple(noises), ends=ends, ancestors=(_EMPTY,) * INTERVALS)
+
+    def beginning(self, index: Array) -> Array:
+        """Return the states (n, M) of some particles at the start of the window."""
+        if len(self.first):
+            return np.asarray(self.mean[:, None] + self.root @ taken(self.first, index))
+        return taken(self.start, index)
+
+    def part(self, motion: Motion, index: Array, length: int) -> Window:
+        """Return the first intervals of the window, of some particles after them, with the states at all ends."""
+        none = (_EMPTY,) * INTERVALS
+        before = self._replace(
+            length=length, ancestors=(*self.ancestors[: length - 1], *none[: INTERVALS - length + 1]),
+            times=self.times[:length], given=self.given[:length], counted=self.counted[:length],
+        )  # fmt: skip
+        path, start = before.path(index)
+        first = np.ascontiguousarray(path[: len(self.first)])
+        begin = self.mean[:, None] + self.root @ first if len(first) else start
+        ends = np.zeros((length, *start.shape))
+        motion.advanced(joined(self.events[:length]), np.ascontiguousarray(begin), np.ascontiguousarray(path[len(first) :]), ends)
+        window = before.moved(path, start, ends[-1])
+        return window._replace(ends=(*ends, *before.ends[length:]))
 
     def target(self, motion: Motion, start: Array) -> Target:
         """Return what the noise of this window must follow."""

@@ -43,12 +43,13 @@ from zakai.methods.reflecting.elements import (
 )
 from zakai.methods.reflecting.filter import State
 from zakai.numerics.line import window as lw
+from zakai.numerics.line.backward import ROUNDING
 from zakai.numerics.line.density import support
 from zakai.numerics.lobatto import Element
 
 Array = Any
 
-PIECE = 10.0  # standard deviations of the noise in which states at the end are taken together
+PIECE = 10.0  # standard deviations of the noise in which states at the end share a transition
 REACH = 8.0  # of them around, between which the state at the start lies
 RESOLVING = 3.7  # points in a standard deviation
 RESOLVED = 1e-6  # Legendre coefficient of a density that the points of the transition resolve
@@ -127,7 +128,6 @@ POINTS = 256  # of a message, on the whole element of the density
 MODES_REACH = 4.0  # standard deviations of the noise around the supports of density and message
 QUADRATURE = 192  # points at which a message is projected onto the modes
 SHARE = 1e-2  # of the tolerance that modes may leave
-ROUNDING = 1e-15  # of the maximum: smaller values of a message are not kept
 
 
 def _window(prepared: Prepared, lower: float, upper: float) -> lw.Window:

@@ -39,7 +39,7 @@ from zakai.methods.reflecting.elements import (
 from zakai.models.numeric import numpy_function
 from zakai.models.prior import DensityPrior
 from zakai.numerics.line.product import General, Likelihood, place
-from zakai.numerics.line.steps import RELIABLE
+from zakai.numerics.line.steps import RELIABLE, error_made
 from zakai.numerics.lobatto import Element
 from zakai.numerics.prior_grid import mixture_log_density, prior_grid
 
@@ -181,7 +181,7 @@ def _step(prepared: Prepared, k: int, state: State, observed: np.ndarray) -> tup
         values, element, more = _multiplied(prepared, values, element, likelihood, report, negligible)
         gained = gained + more
     mean, variance = moments(values, element)
-    made = 2.0 * report.aliasing + 10.0 * report.edge + report.time + 10.0 * report.negative + min(floor * report.growth, 1.0)
+    made = error_made(report.aliasing, report.edge, report.negative, report.time, floor * report.growth)
     retained = error_remainder(before[1], predicted[1], variance, spread(prepared, k, length, float(mean.real)))
     error = max(made + state.error * retained, RELIABLE * prepared.promised)
     health = {

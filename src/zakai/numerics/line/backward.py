@@ -42,7 +42,7 @@ SMALLEST = 1e-13  # value of a smoothed density relative to its maximum that is 
 UNRESOLVED = 1e-5  # spectrum of a smoothed density at the highest frequencies up to which sums over the points are integrals
 FEWEST = 12  # points of a message
 ROUGH = 0.01  # of the error that an interval may make: what a grid and rounding may leave
-ROUNDING = 1e-15  # of the maximum: smaller values of psi are not kept
+ROUNDING = 1e-15  # of the maximum: smaller values of psi count as this
 SURE = 100.0  # errors of psi from which its small values count
 LEAST = 1e-11  # of the maximum: the same
 NOISE = 4e-16  # rounding of a decomposition relative to the norm of psi
@@ -100,7 +100,7 @@ class Gauged(NamedTuple):
 
 
 class BackwardSteps(NamedTuple):
-    """The message before the last `number` intervals, which were taken, and the smoothed densities (K, N) with their reports."""
+    """The message before the last `number` intervals, and the smoothed densities (K, N) with their reports."""
 
     message: Message
     number: int
@@ -187,7 +187,7 @@ def _decomposed(
     message: Message, filtered: Filtered, gauged: Gauged, observed: Observed, lengths: Array, limits: Limits,
     waves: tuple[Array, Array, Array, Array], results: Results,
 ) -> tuple[int, float, float, float]:  # fmt: skip
-    """How many intervals were taken, the error, the logarithm of the scale of psi, which is replaced, and its reliable values.
+    """Return the number of intervals, the error, the logarithm of the scale of psi, which is replaced, and its reliable values.
 
         psi(start) = U exp(-tau lambda) U' (l psi(stop)),      l the likelihood of what is observed at the end
     """
@@ -366,7 +366,7 @@ def _adjoint(
     message: Message, filtered: Filtered, grid: Grid, steps: Steps, seen: Observed, limits: Limits, known: Constants,
     results: Results,
 ) -> tuple[int, int, int, int, float]:  # fmt: skip
-    """How many intervals were taken, and the support, the start and the error of the message b, which is replaced."""
+    """Return the number of intervals, and the support, the start and the error of the message b, which is replaced."""
     b, _, first, last, start, error, product = message
     densities, starts, floors = filtered
     table, _, _, spacing, _ = grid

@@ -14,19 +14,18 @@ from numpy.typing import NDArray
 
 from zakai.numerics.compiled import helper
 from zakai.numerics.line.density import highest_of
-from zakai.numerics.line.window import ALIGNMENT, SIZES
+from zakai.numerics.line.window import ALIGNMENT, SIZES, SMALL
 
 Array = NDArray[Any]
 
 PER = 8  # points of rows in a spacing of the grid
 _STENCIL = 8
 _WEIGHTS = np.array([1.0 / np.prod([float(i - j) for j in range(8) if j != i]) for i in range(8)])
-_DEPTH = 36.0  # logarithm below the largest value from which cells are left out
+DEPTH = 36.0  # logarithm below the largest value from which cells are left out
 _TAIL = 32.0  # logarithm below the largest value at the ends of the range
-_SMALL = 1e-8  # value of a density relative to its maximum below which its logarithm is interpolated
 _CHANGE = 1.0  # of the likelihood in a cell, in standard deviations, up to which a cell is not divided
-_LEVELS = 80
-_MOST_CELLS = 4096
+LEVELS = 80
+MOST_CELLS = 4096
 
 
 @helper
@@ -114,23 +113,23 @@ def placed(
         first, last: the points between which it is not negligible.
         likelihood: the likelihood.
     """
-    left, width, level, best = np.empty(_MOST_CELLS), np.empty(_MOST_CELLS), np.empty((_MOST_CELLS, 3)), -np.inf
+    left, width, level, best = np.empty(MOST_CELLS), np.empty(MOST_CELLS), np.empty((MOST_CELLS, 3)), -np.inf
     weights, h, count, done = np.empty(_STENCIL), np.empty(likelihood.rows.shape[0]), last - first, 0
     for j in range(count):
         left[j], width[j] = first + j, 1.0
-    for _ in range(_LEVELS):
+    for _ in range(LEVELS):
         for c in range(done, count):
             highest, top, bottom = _surveyed(left[c], width[c], logs, likelihood, weights, h)
             level[c, 0], level[c, 1], level[c, 2], best = highest, top, bottom, max(best, highest)
-        # What is not left out is kept at the front, what is to be divided at the back.
-        retained, more = done, _MOST_CELLS
+        # Cells that are done go to the front, cells to be divided to the back.
+        retained, more = done, MOST_CELLS
         for c in range(done, count):
             highest, spread = level[c, 0], level[c, 1] - level[c, 2]
-            if highest + 0.5 * spread + 1.0 >= best - _DEPTH:
+            if highest + 0.5 * spread + 1.0 >= best - DEPTH:
                 depth = best - highest
                 change = np.sqrt(2.0 * (depth + spread)) - np.sqrt(2.0 * depth)
                 if change > _CHANGE and width[c] > 1e-13 * logs.size:
-                    if count + 2 * (_MOST_CELLS - more + 1) > _MOST_CELLS // 2:
+                    if count + 2 * (MOST_CELLS - more + 1) > MOST_CELLS // 2:
                         return np.nan, np.nan, np.nan
                     more -= 1
                     left[more], width[more] = left[c], width[c]
@@ -138,7 +137,7 @@ def placed(
                     left[retained], width[retained], level[retained, 0] = left[c], width[c], highest
                     retained += 1
         done = count = retained
-        for c in range(more, _MOST_CELLS):
+        for c in range(more, MOST_CELLS):
             for part in range(2):
                 left[count], width[count] = left[c] + 0.5 * part * width[c], 0.5 * width[c]
                 count += 1
@@ -170,11 +169,11 @@ def interpolated(values: Array, top: float, at: Array, result: Array, weights: A
         else:
             sine = np.sin(np.pi * (at[i] - near)) / np.pi
             result[i] *= sine if near % 2 == 0 else -sine
-        if not (result[i] >= _SMALL * top):
+        if not (result[i] >= SMALL * top):
             first, logs = weigh(at[i], values.size, 1, weights), 0.0
             for k in range(weights.size):
                 logs += weights[k] * np.log(values[first + k]) if weights[k] != 0.0 else 0.0
-            result[i] = np.exp(logs) if logs < np.log(2.0 * _SMALL * top) and 0 <= at[i] <= values.size - 1 else 0.0
+            result[i] = np.exp(logs) if logs < np.log(2.0 * SMALL * top) and 0 <= at[i] <= values.size - 1 else 0.0
 
 
 @helper
@@ -251,7 +250,7 @@ def sampled(
 PROFILE = 4096  # offsets at which f and G are known without a grid
 REACH = 7.6  # standard deviations of the noise by which the support grows
 FAR = 3.0  # ranges of a density that it moves in an interval, above which grids move with it
-_SPACING = 0.34  # spacing in standard deviations of the noise, at most: the shortest wave decays by exp(-42)
+SPACING = 0.34  # spacing in standard deviations of the noise, at most: the shortest wave decays by exp(-42)
 _MARGIN = 7.2  # of them beyond the support: the waves that R' leaves everywhere end there, and spread from the ends
 _NARROW = 7.0  # support of a density in standard deviations of the noise
 _APART = 32  # the centres of coarse grids are multiples of so many spacings
@@ -294,7 +293,7 @@ def outlook(low: float, high: float, tau: float, unit: float, profile: Array) ->
     shift = tau * profile[0, at] * relative(here)
     there = -tau * profile[1, int(min(max(at + shift * per, 0.0), last))]
     fast, slow = max(here, there, 0.0), max(min(here, there), -1.0)
-    spacing = _SPACING * np.sqrt(least * tau * relative(2.0 * fast))
+    spacing = SPACING * np.sqrt(least * tau * relative(2.0 * fast))
     spacing = unit * 2.0 ** (0.5 * np.floor(2.0 * np.log2(spacing / unit) + 1e-9))
     half, centre = 0.5 * (high - low) * np.exp(-slow) + REACH * wide * np.sqrt(relative(2.0 * slow)), 0.5 * (low + high)
     spacing = np.nan if abs(shift) > 2.0 * FAR * half else spacing

@@ -59,6 +59,7 @@ from zakai.numerics.line.steps import (
     likelihood,
     observation_of,
     product,
+    step_error,
 )
 from zakai.numerics.line.window import ALIGNMENT, CUT
 
@@ -181,7 +182,7 @@ def _loop(kernels: bool, splits: bool, samples: bool, weak: bool, closed: bool) 
                 worst, gained = max(worst, aliasing), gained + added
             # The report.
             row[1], row[2] = moments(now)[1:]
-            made = 2.0 * worst + 10.0 * edge + move.rounding + move.error + 10.0 * negative + min(floor * growth, 1.0)
+            made = step_error(worst, edge, negative, move.rounding + move.error, floor * growth)
             if not (made <= most):
                 status = FAILED
                 break

@@ -51,8 +51,9 @@ from zakai.numerics.line.steps import (
     SIZE,
     UNRESOLVED,
     product,
+    step_error,
 )
-from zakai.numerics.line.window import CUT, LARGEST
+from zakai.numerics.line.window import CUT, EDGE, LARGEST
 
 Array = NDArray[Any]
 
@@ -272,7 +273,6 @@ class Results(NamedTuple):
 
 
 STAY, OWN, PLACE = range(3)  # steps on the grid of the density; on its own grid the first transition, or none
-_EDGE = 1e-11  # density at the outermost points, relative to the maximum
 _TRIALS = 6  # coarse grids on which a step is tried
 
 
@@ -353,7 +353,7 @@ def advance(
             aliasing, top = unresolved(propagated, cosine, sine), propagated[highest_of(propagated)]
             on_left = max(abs(propagated[first]), abs(propagated[first + 1]))
             on_right = max(abs(propagated[last]), abs(propagated[last - 1]))
-            edge, bound = 0.0 if closed else max(on_left, on_right) / top, max(_EDGE, 4.0 * aliasing)
+            edge, bound = 0.0 if closed else max(on_left, on_right) / top, max(EDGE, 4.0 * aliasing)
             resolved = aliasing <= max(30.0 * negligible, 1e-5 * allowed)
             if not (aliasing < np.inf and rounding <= max(1e-11, 1e-3 * allowed) and (resolved or not stays)):
                 return i, FAILED
@@ -428,7 +428,7 @@ def advance(
             edge = max(edge, on_left, on_right)
         row[1], row[2] = moments(now)[1:]
         # What the ends of the grid absorb is missing.
-        made = 2.0 * aliasing + 10.0 * (edge + negative) + rounding + unsure + missing + min(floor * growth, 1.0)
+        made = step_error(aliasing, edge, negative, rounding + unsure + missing, floor * growth)
         if not ((closed or not seen or max(on_left, on_right) < 1e-10) and made <= allowed):
             return i, FAILED
         ratio = min(max(np.sqrt(before * row[2]) * spacing / predicted, 0.3), 1.0)

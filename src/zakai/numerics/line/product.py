@@ -1,4 +1,4 @@
-"""The product of a density on a grid with a likelihood that may be much narrower, stand far in its tails, or have kinks.
+"""The product of a density on a grid with a likelihood that may be much narrower, lie far in its tails, or have kinks.
 
 Of a function F with a kink, sums over a grid of F times a smooth function are accurate to second order only, and operators that
 contain F too.  With the values
@@ -23,13 +23,11 @@ from numpy.typing import NDArray
 from zakai.numerics.compiled import kernel
 from zakai.numerics.line import window as lw
 from zakai.numerics.line.density import moments, support
+from zakai.numerics.line.grid_choice import DEPTH, LEVELS, MOST_CELLS
 from zakai.numerics.line.steps import exponent_added
 
 Array = NDArray[Any]
 
-_DEPTH = 36.0  # logarithm below the best bound from which parts of the line are left out
-_LEVELS = 80
-_MOST_CELLS = 4096
 _NOTHING = 1e-290
 
 
@@ -79,7 +77,7 @@ Likelihood = Gaussian | General
 
 
 class Product(NamedTuple):
-    """The normalised product on its grid, the logarithm of its mass, and how deep in the tails of the density it stands.
+    """The normalised product on its grid, the logarithm of its mass, and how deep in the tails of the density it lies.
 
     `growth` is the factor by which an error that is uniform, relative to the maximum of the density, is relative to the product.
     """
@@ -236,16 +234,16 @@ def place(offsets: Array, logs: Array, likelihood: Likelihood, origin: float) ->
         return np.asarray(np.interp(points.reshape(-1), offsets, logs, left=-200.0, right=-200.0)).reshape(points.shape)
 
     cells = np.stack([offsets[:-1], offsets[1:]], axis=1)
-    for _ in range(_LEVELS):
+    for _ in range(LEVELS):
         product, bound, change = _surveyed(cells, prior, likelihood, origin)
         best = float(product.max())
         if not np.isfinite(best):
             return None
-        keep = bound >= best - _DEPTH  # equal, where the logarithms are so large that nothing can be subtracted
+        keep = bound >= best - DEPTH  # equal, where the logarithms are so large that nothing can be subtracted
         cells, change, product = cells[keep], change[keep], product[keep]
         widths = cells[:, 1] - cells[:, 0]
         divide = (change > 0.7) & (widths > 1e-14 * np.max(np.abs(offsets)) + 1e-300)
-        if not divide.any() or len(cells) > _MOST_CELLS:
+        if not divide.any() or len(cells) > MOST_CELLS:
             break
         quarters = cells[divide, :1] + widths[divide, None] * np.linspace(0.0, 1.0, 5)
         parts = np.stack([quarters[:, :-1], quarters[:, 1:]], axis=2).reshape(-1, 2)

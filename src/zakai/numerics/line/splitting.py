@@ -36,12 +36,11 @@ from zakai.numerics.exponentials import exponentiate
 from zakai.numerics.line.averages import AVERAGES, EARLY, LATE, MEAN, MOST_MAGNUS, averaged, averaging, operators
 from zakai.numerics.line.density import highest_of, moments
 from zakai.numerics.line.gaussian_kernels import filtered, narrow_taps, taps_of, wrapped
-from zakai.numerics.line.steps import CELL, DRIFT, IMPOSSIBLE, OBSERVED, SLOPE, Coefficients, Transition, failed
+from zakai.numerics.line.steps import CELL, DRIFT, IMPOSSIBLE, OBSERVED, OVERFLOW, SLOPE, Coefficients, Transition, failed
 
 Array = NDArray[Any]
 
 MOST_SUBSTEPS = 64
-OVERFLOW = 690.0
 STEEPEST = 0.5  # change of exponents between points for which the filter of a narrow kernel is accurate
 
 
@@ -279,7 +278,7 @@ class Interval(NamedTuple):
     """What the filter did in an interval on a grid.
 
     `observed` (m,) acts `inside` the interval or not at all; `pairs` of averages of the coefficients, zero for the mean, were
-    taken in `substeps`, with a kernel that is `narrow` in spacings or not.
+    used in `substeps`, with a kernel that is `narrow` in spacings or not.
     """
 
     length: float

@@ -274,7 +274,7 @@ def exponent_added(h: Array, centre: Array, precision: Array, observed: Array, w
     return constant
 
 
-_OVERFLOW = 690.0
+OVERFLOW = 690.0  # exponent below which exp is finite
 _LEAST = 1e-280  # value of a density where its product with a likelihood is largest
 _MOST_GROWTH = 1e80
 
@@ -342,6 +342,24 @@ def checked(
     return status, mass, aliasing, edge, negative, highest
 
 
+def error_made(aliasing: float, edge: float, negative: float, time: float, amplified: float) -> float:
+    """Return the error of a step, of the mean in standard deviations and of the log-likelihood.
+
+        2 aliasing + 10 (edge + negative) + time + min(amplified, 1)
+
+    Args:
+        aliasing: the spectrum that the grid does not resolve, relative to the mass: both its sides count.
+        edge: the density at the ends of the grid, relative to the maximum: what lies beyond counts with its squared distance.
+        negative: the negative share of the mass, which counts in the same way.
+        time: the errors of the transition in time and of rounding.
+        amplified: the error of small values of the density, times its growth by a sample.
+    """
+    return 2.0 * aliasing + 10.0 * (edge + negative) + time + min(amplified, 1.0)
+
+
+step_error = helper(error_made)
+
+
 @helper
 def copied(table: Array, start: int, to: Array) -> None:
     """Copy the columns of terms (R, 4 + m, T) from `start` on."""
@@ -381,11 +399,11 @@ def product(now: Array, b: Array) -> tuple[float, float, float]:
         return np.nan, growth, depth
     reference, scale, factors = np.log(largest), 1.0 / now[top], np.empty(now.size)
     for j in range(now.size):
-        factors[j] = min(b[j] - b[top], _OVERFLOW)
+        factors[j] = min(b[j] - b[top], OVERFLOW)
     exponentiate(factors)
     for j in range(now.size):
         growth += factors[j]
-        now[j] = now[j] * scale * factors[j] if b[j] - b[top] < _OVERFLOW else np.exp(logs[j] + b[j] - best)
+        now[j] = now[j] * scale * factors[j] if b[j] - b[top] < OVERFLOW else np.exp(logs[j] + b[j] - best)
         total += now[j]
     for j in range(now.size):
         now[j] /= total

@@ -58,15 +58,16 @@ def _nearest(values: Array, window: Window, at: Array) -> tuple[Array, Array]:
 Operator = Array | FourierOperator
 
 SIZES = (32, 48, 64, 80, 96, 112, 128, 160, 192, 256, 384, 512, 768, 1024, 1536, 2048, 3072, 4096)
-LARGEST = 384  # points of a grid on which densities are moved by matrices
-LARGE = 1024  # points of a grid on which messages are moved by matrices, and densities by kernels and splitting
+LARGEST = 384  # points of a grid on which matrices propagate densities
+LARGE = 1024  # points of a grid on which matrices propagate messages, and kernels and splitting densities
 CUT = 1e-13  # density relative to its maximum that a new grid must hold
 DEEP = 1e-20  # the same of densities whose small values are accurate
 SMALL = 1e-8  # density relative to its maximum below which its logarithm is interpolated
 NEGLIGIBLE = 1e-13  # spectrum relative to the mass that need not be resolved
 TOGETHER = 256  # points at which values of a large grid are interpolated together
 GROSS = 1e-4  # spectrum at the highest frequencies from which it is that of what a grid does not resolve, not of noise
-ALIGNMENT = 8  # centres stand at multiples of so many spacings
+EDGE = 1e-11  # density at the outermost points, relative to the maximum, that a grid may cut off
+ALIGNMENT = 8  # centres are at multiples of so many spacings
 
 
 class Window(NamedTuple):
@@ -145,6 +146,10 @@ class GridCheck(NamedTuple):
     aliasing: float
     rough: bool
     resolving: float
+
+    def unresolved(self, negligible: float, noise: float) -> bool:
+        """Return whether a finer grid is needed: the spectrum is not negligible, and not that of kinks or noise up to a level."""
+        return self.aliasing > 30.0 * negligible and (self.aliasing > noise or not self.rough)
 
 
 def grid_check(values: Array, closed: bool, negligible: float = NEGLIGIBLE, cut: float = CUT) -> GridCheck:

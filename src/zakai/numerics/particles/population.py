@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import types
@@ -11,6 +11,7 @@ from zakai.numerics.compiled import kernel
 from zakai.numerics.particles.formulas import F1, F2, F3
 
 Array = Any
+_NEGLIGIBLE = 40.0  # of the logarithm of a weight, below the largest
 I4, I8 = types.int32[::1], types.int64[::1]
 
 
@@ -87,35 +88,56 @@ def lineage(parents: Array, sizes: Array, weights: Array, deviations: Array, rou
         families[lag] = count
 
 
-@kernel(types.void(F2, F2, F3, F1, F1, F1, I4))
-def backward_draws(later: Array, centres: Array, whiten: Array, logs: Array, period: Array, uniforms: Array, out: Array) -> None:
-    """Write for each later state (n, M) one of N candidates (M,), drawn with the weights exp(logs) N(later; centre, covariance).
+class Candidates(NamedTuple):
+    """What a later state may come from: N particles, and its own past.
 
-    `whiten` (N, n, n) are the inverses of Cholesky's factors of the covariances, `logs` (N,) contain their determinants, and
-    `period` (n,) is that of an angle, else zero.
+    `centres` (n, N), `whiten` (N or 1, n, n), the inverses of Cholesky's factors of the covariances, `logs` (N,), which contain
+    their determinants where these differ, `own` (M,), the logarithms of the weight of the own past of each later state, and
+    `period` (n,), that of an angle, else zero.
     """
+
+    centres: Array
+    whiten: Array
+    logs: Array
+    own: Array
+    period: Array
+
+
+@kernel(types.void(F2, types.NamedTuple((F2, F3, F1, F1, F1), Candidates), F1, I4))
+def backward_draws(later: Array, candidates: Any, uniforms: Array, out: Array) -> None:
+    """Write for each later state (n, M) one of N candidates, drawn with the weights exp(logs) N(later; centre, covariance).
+
+    -1 stands for its own past.
+    """
+    centres, whiten, logs, own, period = candidates
     n, count = centres.shape
+    single = whiten.shape[0] == 1
     found, d = np.empty(count), np.empty(n)
     for j in range(later.shape[1]):
-        top = -np.inf
+        top = own[j]
         for i in range(count):
             value = logs[i]
             for a in range(n):
+                if value < top - _NEGLIGIBLE:
+                    break
                 d[a] = later[a, j] - centres[a, i]
                 if period[a] > 0.0:
                     d[a] -= period[a] * np.floor(d[a] / period[a] + 0.5)
-            for a in range(n):
                 w = 0.0
                 for b in range(a + 1):
-                    w += whiten[i, a, b] * d[b]
+                    w += whiten[0 if single else i, a, b] * d[b]
                 value -= 0.5 * w * w
             found[i] = value
             top = max(top, value)
-        total = 0.0
+        total = mine = np.exp(own[j] - top) if top > -np.inf else 0.0
         for i in range(count):
-            found[i] = np.exp(found[i] - top) if top > -np.inf else 1.0
+            apart = found[i] - top if top > -np.inf else 0.0
+            found[i] = np.exp(apart) if apart > -_NEGLIGIBLE else 0.0
             total += found[i]
-        rest, place = uniforms[j] * total, count - 1
+        rest, place = uniforms[j] * total - mine, count - 1
+        if rest <= 0.0 and mine > 0.0:
+            out[j] = -1
+            continue
         for i in range(count):
             rest -= found[i]
             if rest <= 0.0:

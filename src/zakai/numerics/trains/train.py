@@ -173,7 +173,24 @@ class Train:
         likely, drawn = np.concatenate([p, q], axis=1)
         # The square roots of an axis with no mass are drawn nowhere; both probabilities are zero there.
         weights = likely / np.maximum(0.5 * likely + 0.5 * drawn, 1e-300)
-        return np.concatenate([plain, wide], axis=1), weights / weights.sum()
+        weights = weights / weights.sum()
+        return self._with_moments(np.concatenate([plain, wide], axis=1), weights), weights
+
+    def _with_moments(self, x: Array, weights: Array) -> Array:
+        """Return points (n, P) after the affine map, near the identity, that gives them the moments of the train.
+
+        Frames that are made from points are then as free of chance as the density: independent states stay on axes of their own.
+        """
+        if self.grid.closed.any():
+            return x
+        mean, P = self.moments()
+        own = x @ weights
+        apart = x - own[:, None]
+        try:
+            L, C = np.linalg.cholesky((apart * weights) @ apart.T), np.linalg.cholesky(P)
+        except np.linalg.LinAlgError:
+            return x
+        return np.asarray(mean[:, None] + C @ np.linalg.solve(L, apart))
 
     def scaled(self, factor: float) -> Train:
         """Return the train times a number."""

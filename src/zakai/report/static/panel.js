@@ -193,7 +193,7 @@ export class Panel {
     const across = this.tip.offsetWidth, down = this.tip.offsetHeight;
     const beside = at[0] + 14 + across <= width ? at[0] + 14 : Math.max(0, at[0] - 14 - across);
     Object.assign(this.tip.style, { left: `${beside}px`, top: `${Math.max(0, Math.min(at[1] - down - 8, y + h - down))}px` });
-    if (this.byKey) this.live.textContent = found.lines.join(", ");
+    if (this.byKey) this.spoken.textContent = found.lines.join(", ");
   }
 
   // Gestures -----------------------------------------------------------------------------------------------------------------
@@ -356,7 +356,7 @@ export class Panel {
     this.tip = make(this.stage, "div", { position: "absolute", pointerEvents: "none", padding: "4px 8px", border: "1px solid", borderRadius: "4px",
       fontSize: "12px", whiteSpace: "nowrap", fontVariantNumeric: "tabular-nums", boxShadow: "0 1px 4px rgb(0 0 0 / .25)" }, testid ? { "data-testid": `${testid}-hover` } : {});
     this.tip.hidden = true;
-    this.live = make(this.root, "div", HIDDEN, { role: "status", "aria-live": "polite" });
+    this.spoken = make(this.root, "div", HIDDEN, { role: "status" });
     const help = make(this.root, "p", { margin: "4px 0", fontSize: "12px", maxWidth: "44rem" }, { id });
     help.textContent = HELP;
     help.hidden = true;
