@@ -126,6 +126,12 @@ def test_an_error_of_the_model_is_shown_at_its_place_while_one_types(page: Page)
     expect(page.get_by_test_id("run")).to_be_enabled()
 
 
+def test_a_model_file_of_the_user_is_opened(page: Page, tmp_path: Path):
+    (tmp_path / "mine.toml").write_text(zakai.gallery.text("kalman-bucy-1d"))
+    page.get_by_test_id("model-file").set_input_files(tmp_path / "mine.toml")
+    expect(page.get_by_test_id("fact-method")).to_have_text("kalman-bucy")
+
+
 def test_the_form_and_the_text_say_the_same(page: Page):
     page.get_by_test_id("view-form").click()
     drift = page.get_by_label("drift of x")

@@ -219,7 +219,7 @@ def studio(
     record: Annotated[str | None, typer.Argument(metavar="RECORD", help="The observations (CSV); - is standard input.")] = None,
     port: Annotated[int, typer.Option(metavar="N", min=0, max=65535, help="The port; by default a free one.")] = 0,
     no_browser: Annotated[bool, typer.Option("--no-browser", help="Print the address, and open no browser.")] = False,
-    memory: Annotated[float, typer.Option(metavar="GIB", min=1.0, help="The most memory that a computation may take.")] = 4.0,
+    memory: Annotated[float, typer.Option(metavar="GIB", min=2.0, help="The most memory that a computation may take.")] = 4.0,
 ) -> None:
     """Open a local page on which a model is written, a record is filtered, and the density is shown."""
     from zakai.cli import showing

@@ -42,6 +42,7 @@ def studio(model: str | None, record: str | None, port: int, browser: bool, memo
     config = uvicorn.Config(
         Studio(settings).application(), log_level="critical", access_log=False, lifespan="on", ws="websockets-sansio",
         ws_max_size=LARGEST_MESSAGE, proxy_headers=False, server_header=False, timeout_graceful_shutdown=1,
+        ws_per_message_deflate=False,  # between two processes of one machine it takes more time than it saves
     )  # fmt: skip
     print(f"zakai studio  {address}\nOpen this address in a browser on this machine; Ctrl-C ends the studio.", flush=True)
     if browser:

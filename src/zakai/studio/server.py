@@ -204,9 +204,7 @@ class Studio:
         """Give the lines of the stream to the runner, as many at once as have arrived while it computed."""
         source = self.settings.follow
         if source is None:
-            why = (
-                "stream: start zakai studio MODEL RECORD.csv to follow a file, or zakai studio MODEL - for standard input"
-            )
+            why = "stream: start zakai studio MODEL RECORD.csv to follow a file, or zakai studio MODEL - for standard input"
             await self.send(packed({**_names(request), "error": why}))
             return
         await self.runner.ask({**request, "do": "stream-begin", "channel": "stream"})

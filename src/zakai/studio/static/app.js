@@ -109,6 +109,13 @@ class Studio {
     if (await this._read()) await this.run();
   }
 
+  /** Take the model of a file of the reader, with the record that is there. */
+  async open(file) {
+    if (file.size > 1 << 20) { this.say(`${file.name}: is larger than 1 MiB, which no model file is.`, true); return; }
+    const text = await file.text();
+    await this.load(text, this.state.data.kind === "file" && this.state.data.file ? { ...this.state.data, columns: undefined, inputs: undefined } : this.data.simulated(text));
+  }
+
   /** The text was changed by the reader. */
   write(text) {
     this.state.text = text;
@@ -246,6 +253,7 @@ class Studio {
     document.addEventListener("keydown", (event) => {
       if (event.key === "Enter" && (event.ctrlKey || event.metaKey)) { event.preventDefault(); this.read.now(); this.run(); }
     });
+    byId("model-file").addEventListener("change", ({ target }) => { if (target.files[0]) this.open(target.files[0]); target.value = ""; });
     byId("skip").addEventListener("click", () => byId("stage").focus());
     byId("theme").addEventListener("click", () => {
       const root = document.documentElement, dark = root.dataset.theme ? root.dataset.theme === "dark" : matchMedia("(prefers-color-scheme: dark)").matches;

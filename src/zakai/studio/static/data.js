@@ -31,7 +31,7 @@ export class Data {
     document.addEventListener("drop", (event) => {
       stop(event);
       const file = event.dataTransfer?.files?.[0];
-      if (file) this.take(file);
+      if (file) (file.name.endsWith(".toml") ? this.studio.open(file) : this.take(file));
     });
   }
 

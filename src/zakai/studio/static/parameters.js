@@ -3,7 +3,7 @@
 import { debounced, h, number, table } from "./dom.js";
 import { LinePanel } from "./panels.js";
 
-const STEPS = 400, ROWS = 128, FEWEST = 100, MOST = 190; // of a slider; cells and densities of a picture while one is dragged
+const STEPS = 400, ROWS = 96, FEWEST = 100, MOST = 160; // of a slider; cells and densities of a picture while one is dragged
 
 export class Parameters {
   constructor(studio) {
@@ -80,7 +80,7 @@ export class Parameters {
     if (studio.running || !studio.summary || studio.result.name !== "main") return;
     if (this.inflight) { this.next = since; return; }
     this.inflight = true;
-    const { from, to, width } = studio.result.seen(), columns = Math.round(Math.min(MOST, Math.max(FEWEST, width / 4)));
+    const { from, to, width } = studio.result.seen(), columns = Math.round(Math.min(MOST, Math.max(FEWEST, width / 5)));
     const found = await studio.ask("slide", { ...studio.request, name: "main", values: this.values, state: studio.result.coordinate, from, to, columns, rows: ROWS });
     this.inflight = false;
     if (found && this.dragged) { // an answer after the release is late
