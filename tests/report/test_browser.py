@@ -240,6 +240,7 @@ def test_by_keyboard_the_pointer_goes_from_time_to_time_and_is_read_aloud(opened
     page.get_by_role("button", name="Mouse and keys").click()
     assert page.get_by_text("Escape hides the pointer").is_visible()
     page.get_by_role("button", name="mean").click()
+    settled(page)
     assert page.get_by_role("button", name="mean").get_attribute("aria-pressed") == "false"
 
 
