@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from zakai.densities._density import wrap
+from zakai.densities._values import wrap
 from zakai.methods._protocol import Info
 from zakai.methods.frame.build import CONTROLS, Builder, difference
 from zakai.methods.frame.chain import MOST_SUBSTEPS, Chain, Prediction, extrapolated
