@@ -230,8 +230,8 @@ def _fit_by_values(
 
     def result_at(theta: np.ndarray, seed: int) -> Any:
         at = model.with_parameters(**dict(zip(names, theta.tolist(), strict=True)))
-        seeds: dict[str, Any] = {} if first is None else {"seed": int(first) + seed}
-        return run_filter(at, record, method, keep="moments", **options, **seeds)
+        own = options if first is None else {**options, "seed": int(first) + seed}
+        return run_filter(at, record, method, keep="moments", **own)
 
     what = f"{model.source}: fit: the search for the largest log-likelihood by {listing(names)}"
     with bar("fitting: log-likelihood") as advance, announced(what):
