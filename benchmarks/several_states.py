@@ -105,7 +105,8 @@ def bootstrap(model, record, count, seed, longest=0.05):
     rng, theta = np.random.default_rng(seed), model.theta()
     f, h = numpy_function(model.drift, model), numpy_function(model.observation, model)
     S = np.diag(np.asarray(model.observation_noise.tolist(), float))
-    g = np.asarray(model.diffusion.tolist(), float)
+    shape, moving = model.diffusion.shape, bool(model.diffusion.free_symbols & set(model.x))
+    g = numpy_function(model.diffusion, model, shape)
     wrapped = np.array(["atan2" in str(part) for part in model.observation])
     x = model.prior.sample(rng, count)
     means, covs, total, t = [], [], 0.0, 0.0
@@ -122,7 +123,14 @@ def bootstrap(model, record, count, seed, longest=0.05):
         d = (stop - t) / steps
         for i in range(steps):
             x = half(x, t + i * d, d / 2)
-            x = x + math.sqrt(d) * rng.standard_normal((count, g.shape[1])) @ g.T
+            noise = math.sqrt(d) * rng.standard_normal((count, shape[1]))
+            if moving:  # Ito, by Milstein's step for one field a state: g w + g g' (w^2 - d) / 2
+                a = g(x, t, theta)
+                up = x + 1e-4 * np.einsum("pij,pj->pi", a, np.ones_like(noise))
+                slope = (g(up, t, theta) - a) / 1e-4
+                x = x + np.einsum("pij,pj->pi", a, noise) + 0.5 * np.einsum("pij,pj->pi", slope, noise**2 - d)
+            else:
+                x = x + noise @ g(x[:1], t, theta)[0].T
             x = half(x, t + (i + 0.5) * d, d / 2)
         t = stop
         apart = z - h(x, t, theta)

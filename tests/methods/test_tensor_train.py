@@ -54,3 +54,120 @@ def test_online_and_restarted_filters_equal_a_record_to_the_bit(tmp_path):
     estimate = online.last
     assert np.array_equal(estimate.mean, result.mean[-1])
     assert np.array_equal(estimate.cov, result.cov[-1])
+
+
+def test_an_observation_eight_deviations_away_is_followed_and_reported():
+    model = track(prior={"kind": "gaussian", "mean": [8, 4, -0.8, 0.3], "cov": np.diag([0.2, 0.2, 0.1, 0.1]).tolist()})
+    times = np.array([0.5, 1.0, 1.5])
+    _, record = zakai.simulate(model, times, seed=1)
+    values = record.values.copy()
+    before = zakai.filter(model, zakai.Record(times[:1], values[:1], "samples"), "kalman-bucy")
+    values[1, 0] = before.mean[-1, 0] + 0.5 * before.mean[-1, 2] + 8.0 * 0.4
+    record = zakai.Record(times, values, "samples")
+    exact, result = zakai.filter(model, record, "kalman-bucy"), zakai.filter(model, record, "tensor-train")
+    deviations = np.sqrt(np.einsum("kii->ki", exact.cov))
+    assert np.abs((result.mean - exact.mean) / deviations).max() < 0.1
+    assert any("tail_depth" in words for words in result.warnings)
+
+
+def test_all_modes_of_squares_are_kept_and_stay_symmetric():
+    n = 4
+    model = zakai.Model(
+        state=[f"x{i}" for i in range(n)], drift=[f"-0.2*x{i} + 0.3*x{(i + 1) % n}**2*x{i}*0" for i in range(n)],
+        diffusion=(0.6 * np.eye(n)).tolist(), observation=[f"x{i}**2/2" for i in range(n)], observation_kind="samples",
+        observation_noise=(0.25 * np.eye(n)).tolist(), prior={"kind": "gaussian", "mean": [0.0] * n, "cov": np.eye(n).tolist()},
+    )  # fmt: skip
+    one = zakai.Model(
+        state=["x"], drift=["-0.2*x"], diffusion=[[0.6]], observation=["x**2/2"], observation_kind="samples",
+        observation_noise=[[0.25]], prior={"kind": "gaussian", "mean": [0.0], "cov": [[1.0]]},
+    )  # fmt: skip
+    times = np.arange(1, 7) * 0.4
+    values = np.tile([3.0, 2.5, 4.0, 0.2], (6, 1))
+    result = zakai.filter(model, zakai.Record(times, values, "samples"), "tensor-train")
+    parts = [zakai.filter(one, zakai.Record(times, values[:, [i]], "samples"), "yau-yau") for i in range(n)]
+    deviations = np.sqrt(np.einsum("kii->ki", result.cov))
+    assert np.abs(result.mean / deviations).max() < 0.02
+    for i, part in enumerate(parts):
+        assert np.allclose(result.cov[:, i, i], part.cov[:, 0, 0], rtol=0.01)
+    assert abs(result.log_likelihood - sum(part.log_likelihood for part in parts)) < 0.02
+    density = result.density(-1).marginal(["x0", "x1"])
+    peaks = density.log_density(np.array([[2.3, 2.1], [-2.3, 2.1], [2.3, -2.1], [-2.3, -2.1], [0.0, 0.0]]))
+    assert np.ptp(peaks[:4]) < 0.1 and peaks[4] < peaks[0] - 3
+
+
+def near(model, record, bound, **options):
+    """Check the means, deviations and log-likelihood against those of a grid of all points."""
+    exact, result = zakai.filter(model, record, "yau-yau"), zakai.filter(model, record, "tensor-train", **options)
+    deviations = np.sqrt(np.einsum("kii->ki", exact.cov))
+    apart = result.mean - exact.mean
+    apart = np.where([name in model.periodic for name in model.state], (apart + np.pi) % (2 * np.pi) - np.pi, apart)
+    assert np.abs(apart / deviations).max() < bound
+    assert np.abs(np.sqrt(np.einsum("kii->ki", result.cov)) / deviations - 1).max() < 2 * bound
+    assert abs(result.log_likelihood - exact.log_likelihood) < bound
+    return result
+
+
+def test_noise_that_depends_on_the_state_agrees_with_a_grid():
+    model = zakai.Model(
+        state=["a", "b"], drift=["a*(1 - b)", "b*(a - 1)"], diffusion=[["0.2*a", 0], [0, "0.2*b"]], observation=["a"],
+        observation_kind="samples", observation_noise=[[0.04]],
+        prior={"kind": "gaussian", "mean": [1.2, 0.8], "cov": [[0.02, 0.0], [0.0, 0.02]]},
+    )  # fmt: skip
+    _, record = zakai.simulate(model, np.array([0.2, 0.5]), seed=1)
+    near(model, record, 2e-2)
+
+
+def test_increments_of_a_nonlinear_sensor_agree_with_a_grid():
+    model = zakai.Model(
+        state=["x", "y"], drift=["cos(x) + 0.5*sin(y)", "cos(y)"], diffusion=[[1, 0], [0, 1]], observation=["x**3", "y**3"],
+        observation_kind="increments", observation_noise=[[1, 0], [0, 1]],
+        prior={"kind": "gaussian", "mean": [0, 0], "cov": [[0.5, 0], [0, 0.5]]},
+    )  # fmt: skip
+    _, record = zakai.simulate(model, np.array([0.05, 0.1, 0.15]), seed=1)
+    near(model, record, 2e-2)
+
+
+def test_a_heading_on_the_whole_circle_agrees_with_a_grid():
+    model = zakai.Model(
+        state=["p", "a"], drift=["cos(a)", "0.3"], diffusion=[[0.2, 0], [0, 0.8]], observation=["p"], observation_kind="samples",
+        observation_noise=[[0.05]], prior={"kind": "gaussian", "mean": [0, 0.5], "cov": [[0.3, 0], [0, 1.5]]}, periodic=["a"],
+    )  # fmt: skip
+    _, record = zakai.simulate(model, np.array([0.3, 0.6, 1.2]), seed=1)
+    near(model, record, 2e-2)
+
+
+def test_a_fast_track_of_two_rows_stays_in_its_frame():
+    model = zakai.Model(
+        state=["x", "v"], drift=["v", "-0.5*sin(x/100)"], diffusion=[[0], [0.3]], observation=["x"], observation_kind="samples",
+        observation_noise=[[0.09]], prior={"kind": "gaussian", "mean": [0, 30], "cov": [0.09, 0.49]},
+    )  # fmt: skip
+    result = zakai.filter(model, zakai.Record([1.0, 2.0], [[29.8], [59.4]], "samples"), "tensor-train")
+    assert np.allclose(result.mean[-1], [59.42, 29.51], atol=5e-3) and abs(result.log_likelihood + 1.353) < 2e-3
+    assert not result.warnings
+
+
+def test_the_density_has_the_moments_quantiles_and_draws_of_its_marginals():
+    model = track(observation=["sqrt(px**2 + py**2)", "atan2(py, px)"])
+    _, record = zakai.simulate(model, np.array([0.3, 0.7]), seed=2)
+    density = zakai.filter(model, record, "tensor-train", tolerance=2e-2).density(-1)
+    mean, cov = density.mean(), density.cov()
+    for i, name in enumerate(NAMES):
+        marginal = density.marginal(name)
+        assert np.allclose(marginal.mean(), mean[i], atol=1e-3) and np.allclose(marginal.cov(), cov[i, i], rtol=1e-2)
+        assert np.allclose(marginal.quantile([0.5]), density.quantile([0.5])[0, i])
+    pair = density.marginal(["vy", "px"])
+    assert np.allclose(pair.mean(), mean[[3, 0]], atol=1e-3) and np.allclose(pair.cov(), cov[np.ix_([3, 0], [3, 0])], atol=1e-3)
+    draws = density.sample(1, 20_000)
+    assert np.abs((draws.mean(axis=0) - mean) / np.sqrt(np.diag(cov))).max() < 0.03
+    assert density.log_density(density.mode()) >= density.log_density(draws[:200]).max()
+
+
+def test_a_fit_finds_the_maximum_by_values():
+    model = zakai.Model(
+        state=["x", "v"], drift=["v", "-a*sin(x)"], diffusion=[[0], [0.3]], observation=["x"], observation_kind="samples",
+        observation_noise=[[0.04]], parameters={"a": 1.0}, prior={"kind": "gaussian", "mean": [0, 1], "cov": [0.1, 0.1]},
+    )  # fmt: skip
+    _, record = zakai.simulate(model, np.arange(1, 7) * 0.5, seed=1)
+    by_values = zakai.fit(model, record, method="tensor-train", tolerance=5e-3)
+    by_gradient = zakai.fit(model, record, method="yau-yau")
+    assert abs(by_values.estimates["a"] - by_gradient.estimates["a"]) < 0.2 * by_gradient.standard_errors["a"]

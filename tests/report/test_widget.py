@@ -92,3 +92,13 @@ def test_a_result_in_a_notebook_has_its_picture_in_a_document_that_fetches_nothi
     assert header["name"] == "x" and len(arrays["times"]) == 600
     assert "default-src 'none'" in page and "https:" not in page
     assert len(html) < 600_000
+
+
+def test_a_stored_result_is_shown_without_filtering_its_record_again(filtered, tmp_path, monkeypatch):
+    filtered[0].save(tmp_path / "result.nc", densities=True)
+    stored = zakai.load_result(tmp_path / "result.nc")
+    monkeypatch.setattr("zakai.engine.loop.advance", lambda *_: pytest.fail("the record was filtered again"))
+    html = stored._repr_html_()
+    page = unescape(html[html.index("srcdoc=") : html.index(" loading=")])
+    _, arrays = on_page(page)["picture"]
+    assert "cells" not in arrays and len(arrays["times"]) == 600

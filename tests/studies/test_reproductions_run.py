@@ -45,6 +45,20 @@ def test_the_log_likelihood_of_the_cell_model_is_near_that_of_particles(tmp_path
     assert (tmp_path / "log-likelihoods.png").exists()
 
 
+def test_log_likelihoods_by_particles_vary_little_and_agree_with_the_density_on_a_grid(tmp_path):
+    found = studies.reproduce("heng-controlled", tmp_path, states=4, observations=4, counts=15, particles=1000, repeats=4)
+    lorenz, neuron = found.tables[0].rows
+    assert lorenz[2] < 0.5 and neuron[2] < 0.3 and verdicts(found)[1] == "agrees"
+    assert abs(neuron[1] - neuron[4]) < 0.3
+    assert (tmp_path / "log-likelihoods.png").exists()
+
+
+def test_particles_follow_lorenz_better_than_an_ensemble(tmp_path):
+    found = studies.reproduce("lorenz-63-ramgraber-2022", tmp_path, observations=80, unused=30, particles=500)
+    assert found.comparisons[-1].ours < 0.43
+    assert (tmp_path / "errors.png").exists()
+
+
 def test_blocks_give_the_posterior_of_the_bimodal_problem(tmp_path):
     found = studies.reproduce("al-jarrah-2024", tmp_path, largest=4, records=2, samples=400)
     assert "agrees" in verdicts(found)

@@ -39,8 +39,9 @@ class Analysis:
 
     `omega` (n, n) and `eta` are None where G is singular, `yau_form` and `q` where the drift has no Yau form; for samples
     `q` is without h'S^-1 h, for they do not act between their times.  `algebra` is an `EstimationAlgebra` and `observed_block` an
-    `ObservedBlock`, or None where it is not known; `explosion` is an `Explosion`, or None where none was seen; `blocks` are
-    the `Block`s that the system falls into; each is looked for when it is first asked for.  `methods` are the conditions of
+    `ObservedBlock`, or None where it is not known; `explosion` is an `Explosion`, or None where none was seen;
+    `conditionally_linear` the names of the states that are linear given the others, with the reason; `blocks` are the `Block`s
+    that the system falls into; each is looked for when it is first asked for.  `methods` are the conditions of
     every method by its name, `recommended` the method that "auto" takes, or None; for a system that is filtered block by block it
     is what `division.method` says.  `print` shows a page.
     """

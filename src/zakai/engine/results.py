@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -91,7 +91,8 @@ class FilterResult:
         table = _display.html_table(repr(self), ("", f"mean at {when}", "deviation"), rows, self.warnings)
         from zakai.report import notebook_picture
 
-        return table + str(notebook_picture(self))
+        shown = self if self._again is None else replace(self, _density=None)  # which would filter the record again
+        return table + str(notebook_picture(shown))
 
     @property
     def cov(self) -> np.ndarray:

@@ -169,8 +169,10 @@ def fit(
     values = _start(model, names, start)
     box = _box(model, names, values, bounds)
     now = model.with_parameters(**dict(zip(names, values.tolist(), strict=True)))
-    if any(setting.method.random for setting in planned(now, None, method, options, by_value=False).settings):
-        return _fit_of_draws(now, record, names, values, box, method, options)
+    methods = [setting.method for setting in planned(now, None, method, options, by_value=False).settings]
+    if any(one.random or one.by_values for one in methods):
+        random = any(one.random for one in methods)
+        return _fit_by_values(now, record, names, values, box, method, options if random else {**options, "seed": None})
     function, known = LogLikelihood(now, record, method, names, options), dict[bytes, tuple[float, np.ndarray]]()
     what = f"{model.source}: fit: the search for the largest log-likelihood by {listing(names)}"
     with bar("fitting: log-likelihood and gradient") as advance, announced(what):
@@ -212,7 +214,7 @@ def fit(
     )
 
 
-def _fit_of_draws(
+def _fit_by_values(
     model: Model,
     record: Record,
     names: tuple[str, ...],
@@ -221,19 +223,21 @@ def _fit_of_draws(
     method: str,
     options: dict[str, Any],
 ) -> Fit:
-    """Return the fit by a log-likelihood with random errors, with common random numbers."""
+    """Return the fit by values of a log-likelihood, with common random numbers; a seed of None is for one without."""
     known: dict[tuple[bytes, int], float] = {}
-    first = int(options.get("seed", 0))
+    options = dict(options)
+    first = options.pop("seed", 0)
 
     def result_at(theta: np.ndarray, seed: int) -> Any:
         at = model.with_parameters(**dict(zip(names, theta.tolist(), strict=True)))
-        return run_filter(at, record, method, keep="moments", **{**options, "seed": first + seed})
+        seeds = {} if first is None else {"seed": int(first) + seed}
+        return run_filter(at, record, method, keep="moments", **options, **seeds)
 
     what = f"{model.source}: fit: the search for the largest log-likelihood by {listing(names)}"
     with bar("fitting: log-likelihood") as advance, announced(what):
 
         def value(theta: np.ndarray, seed: int) -> float:
-            key = theta.tobytes(), seed
+            key = theta.tobytes(), 0 if first is None else seed
             if key not in known:
                 if advance is not None:
                     advance(len(known) + 1, None)
@@ -246,7 +250,7 @@ def _fit_of_draws(
         found = random_maximum(value, values, box)
     result = result_at(found.values, 0)
     errors = np.sqrt(np.diag(found.covariance))
-    warnings = [sentence(names, found), *result.warnings]
+    warnings = [*([] if first is None else [sentence(names, found)]), *result.warnings]
     if not found.converged:
         warnings.insert(0, "the fit did not converge; these are the best values that were found")
     estimates = dict(zip(names, found.values.tolist(), strict=True))
@@ -256,7 +260,8 @@ def _fit_of_draws(
         log_likelihood=result.log_likelihood,
         model=model.with_parameters(**estimates),
         converged=found.converged,
-        message=f"{'converged' if found.converged else 'not converged'}: quadratics through values with common random numbers",
+        message=f"{'converged' if found.converged else 'not converged'}: quadratics through values"
+        + (" with common random numbers" if first is not None else ""),
         iterations=found.iterations,
         covariance=found.covariance,
         method=result.method,

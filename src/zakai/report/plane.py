@@ -19,7 +19,7 @@ from zakai.report.frames import pack
 from zakai.report.heatmap import is_periodic, state_names, true_states
 from zakai.report.picture import number_of
 
-SIZE = 81  # points along an axis of the window; odd, so that the mean is one
+SIZE = 121  # points along an axis of the window; odd, so that the mean is one
 PROBABILITIES = (0.5, 0.95)
 _REACH = 5.0  # standard deviations along each axis of the window
 _SCALE = 65535

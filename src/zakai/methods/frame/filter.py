@@ -31,6 +31,7 @@ AUDIT = 10  # intervals between comparisons of s and 2 s substeps, where the las
 # What is extrapolated from both has a third to a twentieth of it.
 TIME_SHARE, GAIN, ACCEPTED, SAFETY = 1.0, 4.0, 8.0, 0.7
 IN_TAILS = 0.03  # error of a mean over tolerance e^depth: linear tracks with observations 4 and 6 deviations away
+BEYOND = 0.3  # error of a mean over the distance of an observation, where a Gaussian stands for the tails
 WITHIN = 3.0  # tolerances that the error of a mean may reach
 FIGURES = (
     "error_estimate", "tolerance_ratio", "rank", "mass_defect", "off_grid_error", "edge_mass", "tail_depth", "powers",
@@ -131,6 +132,8 @@ def step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[State
     except (Unresolved, np.linalg.LinAlgError):
         n = prepared.model.n
         health = dict.fromkeys(FIGURES, math.nan)
+        # A density that is lost stays lost.
+        state = state._replace(cores=tuple(np.full_like(core, math.nan) for core in state.cores))
         return state, Info(math.nan, np.full(n, math.nan), np.full((n, n), math.nan), health)
 
 
@@ -156,8 +159,8 @@ def _step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[Stat
     # Errors of different builds have different signs; the error of a mean is about half of the error in L1 at most.
     kept = _kept(prediction, prepared, cov)
     error = math.hypot(kept * control.error, 0.5 * (off_grid + prediction.defect + edge + time.error))
-    # Far out a density is known relative to its largest value only; the mean is at most as far off as the observation was.
-    far = min(IN_TAILS * rule.tolerance * math.exp(min(depth, 50.0)), math.sqrt(2.0 * max(depth, 0.0)))
+    # Far out a density is known relative to its largest value only; beyond, a Gaussian stands for it.
+    far = min(IN_TAILS * rule.tolerance * math.exp(min(depth, 50.0)), BEYOND * math.sqrt(2.0 * max(depth, 0.0)))
     error = math.hypot(error, far)
     health = {
         "error_estimate": error,

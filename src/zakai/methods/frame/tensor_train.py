@@ -73,6 +73,7 @@ METHOD: Method[Prepared, State] = Method(
     state=State,
     bounds=BOUNDS,
     differentiable=False,
+    by_values=True,
     valid=valid,
     shorter="raise the option tolerance (command: --option tolerance=...)",
     handles=frozenset(features.ASSUMPTIONS) - {features.OBSERVED_PATH},

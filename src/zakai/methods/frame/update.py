@@ -16,7 +16,7 @@ from zakai.numerics.trains.carried import Carried, Likelihood
 from zakai.numerics.trains.train import Train
 
 FEW = 30.0  # effective points of the prediction that a likelihood must leave, or powers of it are taken
-MOST_POWERS = 8
+MOST_POWERS = 24  # an observation sixty deviations away needs fifteen
 DEPTH_POINTS = 128
 ROUGHLY = 0.01  # relative error that densities between powers of a likelihood need: they only show where the mass is
 OFF_CENTRE, NARROW, WIDE = 0.5, 0.6, 1.6  # shift and deviation of a density in its frame, from which it gets another frame

@@ -16,8 +16,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from zakai.methods.line.cache import Derived
 from zakai.methods.line.model import System, finite, within
-from zakai.methods.line.prepared import Derived, Prepared, TimeInterval
+from zakai.methods.line.prepared import Prepared, TimeInterval
 from zakai.numerics.line import window as lw
 from zakai.numerics.line.averages import GAUSS_NODES, GAUSS_WEIGHTS, Panels, panels
 from zakai.numerics.line.grid_choice import PER, PROFILE

@@ -14,11 +14,12 @@ import numpy as np
 from zakai.methods._protocol import Info, Infos
 from zakai.methods._states import Joined, StackedStates
 from zakai.methods.line import modal
+from zakai.methods.line.cache import Derived
 from zakai.methods.line.coefficients import misses_drift, on_grid_for_drift
-from zakai.methods.line.prepared import Derived, Prepared, State, parts_needed, probed
+from zakai.methods.line.prepared import Prepared, State
 from zakai.methods.line.update import edge_of_moments, grid_check, on_fitting_grid, outside_tables, resampled, state_moments
 from zakai.numerics.line import window as lw
-from zakai.numerics.line.averages import GAUSS_NODES
+from zakai.numerics.line.averages import GAUSS_NODES, parts_needed, probed
 from zakai.numerics.line.gaussian_kernels import BAND
 from zakai.numerics.line.loop import advance
 from zakai.numerics.line.modes import OWN, PLACE, STAY

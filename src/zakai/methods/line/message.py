@@ -11,8 +11,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from zakai.methods.line.cache import Derived
 from zakai.methods.line.coefficients import decomposed
-from zakai.methods.line.prepared import Derived, Prepared, State
+from zakai.methods.line.prepared import Prepared, State
 from zakai.numerics.line import window as lw
 from zakai.numerics.line.backward import FEWEST
 from zakai.numerics.line.operator import Spectral

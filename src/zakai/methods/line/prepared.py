@@ -9,13 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, replace
-from enum import Enum
-from functools import cached_property, lru_cache
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from zakai.methods._protocol import Infos
+from zakai.methods.line.cache import CacheKey, Derived, GridCache, grid_cache_of
 from zakai.methods.line.model import System, finite
 from zakai.methods.line.yau import Kernels, YauLine
 from zakai.methods.yau.kernel import PowerSeries
@@ -23,7 +23,7 @@ from zakai.models.model import Model
 from zakai.models.prior import GaussianPrior
 from zakai.numerics.complex_step import log_determinant
 from zakai.numerics.line import window as lw
-from zakai.numerics.line.averages import GAUSS_NODES, interpolation
+from zakai.numerics.line.averages import GAUSS_NODES, parts_needed, probed
 from zakai.numerics.line.density import support
 from zakai.numerics.line.gaussian_kernels import kernel_size, packed
 from zakai.numerics.line.steps import FACTOR, KERNEL, SPLIT, SPLIT_FACTOR, Limits, Mechanisms, Steps
@@ -36,58 +36,6 @@ NOISE = 3e-15  # error of a density relative to its maximum, which matters in it
 KERNEL_SHARE = 2e-2  # of the promised error that the splitting of one interval may leave in `limited-direct`
 SHARE = 5e-3  # of the tolerance that the splitting of one interval may leave
 SHARED = 128  # points of the largest grid on which many steps share a decomposition
-CACHE_BYTES = 96 * 2**20  # of tables and decompositions of grids, which are stored for a model
-
-
-@lru_cache(maxsize=8)
-def _grid_cache_of(model: Model, theta: bytes, kind: str, setting: Any) -> GridCache:
-    return GridCache()
-
-
-class Derived(Enum):
-    """What is derived of a model on a grid, and held in the cache."""
-
-    TABLES = "f, h and G at the points of a grid"
-    MODES = "the decomposition of the operator on a grid"
-    MESSAGE_MODES = "the decomposition of the operator of messages on a grid"
-    LOBATTO_MODES = "the decomposition of the operator on an element"
-    EXPONENTIAL = "the exponential of the operator on a grid, for one length"
-    COARSE_GRIDS = "grids and their modes as the compiled loop reads them"
-    PROFILE = "f, f' and G around an origin"
-    TERMS = "the terms of f and h in a table that is longer than a grid"
-    FINE = "an h with kinks at nodes between the points"
-    FINE_OF_GRID = "the same of one grid, and h at its centre"
-    HIDDEN_DRIFT = "the error of f between the points of a grid"
-    PRECISION = "the inverse of S for some coordinates"
-    SAMPLE_NOISE = "the inverse of S of a sample, and the constant of its density"
-    ONE_PRECISION = "the inverse of a constant S of what is seen in one interval, and the constant of its likelihood"
-    STEADY = "a coefficient that depends neither on x nor on t"
-    KINKS = "the states between two at which coefficients have kinks"
-
-
-class CacheKey(NamedTuple):
-    """The key of a derived quantity: which, and of what."""
-
-    quantity: Derived
-    at: Hashable
-
-
-class GridCache(dict[CacheKey, tuple[Any, int]]):
-    """Values and their bytes, in the order of their last use; `bytes` is about their sum, which threads may miscount."""
-
-    bytes = 0
-
-    def insert(self, key: CacheKey, value: Any) -> None:
-        """Store a value, and drop those that were used long ago where all are large."""
-        self[key] = value, (size := _bytes_of(value))
-        self.bytes += size
-        if self.bytes > CACHE_BYTES:
-            self.bytes = sum(size for _, size in list(self.values()))
-            while self.bytes > 0.75 * CACHE_BYTES and len(self) > 1:
-                try:
-                    self.bytes -= self.pop(next(iter(self)), (None, 0))[1]
-                except (StopIteration, RuntimeError):  # another thread was faster
-                    break
 
 
 class State(NamedTuple):
@@ -182,7 +130,7 @@ class Prepared:
     def grid_cache(self) -> GridCache:
         """What was computed for single grids, shared by all schedules of a model with these parameters and this method."""
         setting = self.pieces, self.tolerance, self.yau is None, self.kernels is None, self.series is None, self.lie, self.origin
-        return _grid_cache_of(self.model, self.theta.tobytes(), self.theta.dtype.str, setting)
+        return grid_cache_of(self.model, self.theta.tobytes(), self.theta.dtype.str, setting)
 
     def interval(self, k: int, inside: np.ndarray, observed: np.ndarray) -> TimeInterval:
         """Return interval k, of a length above zero, in which increments act `inside` (m,)."""
@@ -327,20 +275,6 @@ class Prepared:
         return result[0]
 
 
-def _bytes_of(value: Any) -> int:
-    """Return the bytes of the arrays in a value and in the attributes of its objects."""
-    if isinstance(value, tuple | list):
-        return sum(map(_bytes_of, value))
-    if isinstance(value, np.ndarray):
-        return value.nbytes
-    return 64 + sum(map(_bytes_of, getattr(value, "__dict__", {}).values()))
-
-
-RESOLVED = 1e-8  # relative error of the interpolants of coefficients in time
-MOST_PARTS = 16  # in which an interval is cut at a time
-PROBES = np.linspace(0.0, 1.0, 129)  # parts of an interval at which coefficients are compared with their interpolants
-
-
 def coefficients_of(prepared: Prepared) -> Coefficients:
     """Return what the loop needs of the coefficients in time of all intervals."""
     schedule, system, theta = prepared.schedule, prepared.system, prepared.theta
@@ -416,24 +350,6 @@ def _mixed_terms(prepared: Prepared, t: np.ndarray) -> np.ndarray:
     if not system.samples:
         terms = np.concatenate([terms, system.observation(points[:, None], t[..., None], prepared.theta)], axis=-1)
     return np.asarray(finite(terms).reshape(*t.shape, -1))
-
-
-def probed(starts: np.ndarray, stops: np.ndarray) -> np.ndarray:
-    """Return times (K, P) at which coefficients are compared with their interpolants, of which the last are before the ends."""
-    return np.asarray(np.clip(starts + (stops - starts) * PROBES, starts, np.nextafter(stops, starts)))
-
-
-def parts_needed(exact: np.ndarray, nodes: np.ndarray) -> np.ndarray:
-    """Return in how many parts (K,) interpolants of values at nodes (K, Q, ...) agree with probes (K, P, ...), 0 for never."""
-    exact, nodes = exact.reshape(*exact.shape[:2], -1), nodes.reshape(*nodes.shape[:2], -1)
-    scale = np.maximum(np.abs(exact).max(axis=1), 1e-300)
-    rest = np.abs(_TO_PROBES @ nodes - exact).max(axis=1) / scale
-    excess = rest.max(axis=1) / RESOLVED
-    more = np.ceil(1.1 * np.nan_to_num(excess) ** (1.0 / len(GAUSS_NODES)))
-    return np.where(excess <= 1.0, 1, np.where(np.isfinite(excess), np.clip(more, 2, MOST_PARTS), 0)).astype(int)
-
-
-_TO_PROBES = interpolation(PROBES)
 
 
 def kinds_of(prepared: Prepared) -> np.ndarray:

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zakai.methods.line.coarse import coarsened
+from zakai.methods.line.cache import Derived
 from zakai.methods.line.coefficients import (
     GROWTH,
     coefficients,
@@ -30,8 +30,9 @@ from zakai.methods.line.coefficients import (
     tables,
 )
 from zakai.methods.line.domain import ALLOWED, lost
+from zakai.methods.line.modal import coarsened
 from zakai.methods.line.model import finite
-from zakai.methods.line.prepared import NOISE, Derived, Prepared, TimeInterval
+from zakai.methods.line.prepared import NOISE, Prepared, TimeInterval
 from zakai.methods.line.update import refitted
 from zakai.numerics.line import window as lw
 from zakai.numerics.line.averages import GAUSS_NODES, GAUSS_WEIGHTS

@@ -8,10 +8,11 @@ from typing import Any
 import numpy as np
 
 from zakai.errors import InputError
+from zakai.methods.line.cache import Derived
 from zakai.methods.line.coefficients import covariance_at, tables
 from zakai.methods.line.domain import variable_of
 from zakai.methods.line.model import System
-from zakai.methods.line.prepared import Derived, Prepared, State
+from zakai.methods.line.prepared import Prepared, State
 from zakai.methods.system.observation import log_likelihood
 from zakai.models.numeric import numpy_function
 from zakai.models.prior import DensityPrior

@@ -110,7 +110,7 @@ class System:
             fields = [sum((g[i, a] * coefficients[a] for a in range(r)), sp.S.Zero) for i in range(n)]
         else:
             self.diffusion = numpy_function(g, model, (n, r))
-        self.formulas, self.given = tuple(drift), tuple(given)
+        self.formulas, self.given = (*drift, *potential), tuple(given)
         self.drift = Expressions([*drift, *potential], model, given, more)
         self.fields = Expressions(fields, model, given, (*more, *coefficients))
         self.process_noise = numpy_function(Q, model, (r, r))

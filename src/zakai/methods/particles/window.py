@@ -107,14 +107,22 @@ class Window(NamedTuple):
 
     def path(self, index: Array | None = None) -> tuple[Array, Array]:
         """Return the noise (D, N) of the particles, or of some, and the states (n, N) at the start of the window."""
-        parts = []
+        if index is None and self.length and len(self.ancestors[self.length - 1]):
+            count = len(self.ancestors[self.length - 1])
+        elif index is None:
+            count = (self.noises[self.length - 1] if self.length else self.first).shape[1]
+        else:
+            count = len(index)
+        out = np.empty((self.width, count))
+        place = len(out)
         for k in reversed(range(self.length)):
-            ancestors = self.ancestors[k]
+            ancestors, noise = self.ancestors[k], self.noises[k]
             if len(ancestors):
                 index = ancestors if index is None else ancestors[index]
-            parts.append(self.noises[k] if index is None else taken(self.noises[k], index))
-        begin = (self.first, self.start) if index is None else (taken(self.first, index), taken(self.start, index))
-        return np.concatenate([begin[0], *parts[::-1]]), np.ascontiguousarray(begin[1])
+            place -= len(noise)
+            out[place : place + len(noise)] = noise if index is None else taken(noise, index)
+        out[:place] = self.first if index is None else taken(self.first, index)
+        return out, np.ascontiguousarray(self.start if index is None else taken(self.start, index))
 
     def moved(self, path: Array, start: Array, end: Array) -> Window:
         """Return the window of particles with this noise (D, N), from these starts, that end there."""
@@ -222,8 +230,7 @@ class Target:
     def sweep(
         self, gaussian: Any, path: Array, control: tuple[float, ...], key: Array
     ) -> tuple[Array, Array, Array, float, float]:
-        """Return moved noise, states, log-likelihoods, the mean acceptance, and the smallest change of a chunk."""
-        path = path.copy()
+        """Move noise in place; return it, states, log-likelihoods, the mean acceptance, and the smallest change of a chunk."""
         out, total, arrays = np.empty_like(self.start), np.empty(path.shape[1]), self.arrays
         moved, numbers = np.zeros((-(-len(total) // CHUNK), 2)), np.array(control)
         paths = moves.Paths(self.start, path, out, total, moved)

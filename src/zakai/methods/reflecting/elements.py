@@ -16,8 +16,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from zakai.errors import InputError
+from zakai.methods.line.cache import Derived
 from zakai.methods.line.coefficients import covariance_at, offset_of, potential_of, precision_of, tables
-from zakai.methods.line.prepared import Derived, Prepared, TimeInterval
+from zakai.methods.line.prepared import Prepared, TimeInterval
 from zakai.methods.line.transition import Report
 from zakai.methods.line.volumes import SHARE, advanced_by, cell_plan_of, kinks_between
 from zakai.models.domain import Interval

@@ -26,6 +26,9 @@ GAUSS_WEIGHTS: Array = _weights / 2.0
 
 PROBES = 129  # times of an interval at which coefficients are compared with their interpolants
 _PROBES_OF_PART = 21
+_PROBES = np.linspace(0.0, 1.0, PROBES)
+RESOLVED = 1e-8  # relative error of the interpolants of coefficients in time
+MOST_PARTS = 16  # in which an interval is cut at a time
 _MOST = 600
 
 
@@ -42,6 +45,24 @@ _COEFFICIENTS = np.linalg.inv((2.0 * GAUSS_NODES[:, None] - 1.0) ** _POWERS)
 def _probes(count: int) -> tuple[Array, Array]:
     points = np.linspace(0.0, 1.0, count)
     return points, interpolation(points)
+
+
+def probed(starts: Array, stops: Array) -> Array:
+    """Return times (K, P) at which coefficients are compared with their interpolants, of which the last are before the ends."""
+    return np.asarray(np.clip(starts + (stops - starts) * _PROBES, starts, np.nextafter(stops, starts)))
+
+
+def parts_needed(exact: Array, nodes: Array) -> Array:
+    """Return in how many parts (K,) interpolants of values at nodes (K, Q, ...) agree with probes (K, P, ...), 0 for never."""
+    exact, nodes = exact.reshape(*exact.shape[:2], -1), nodes.reshape(*nodes.shape[:2], -1)
+    scale = np.maximum(np.abs(exact).max(axis=1), 1e-300)
+    rest = np.abs(_TO_PROBES @ nodes - exact).max(axis=1) / scale
+    excess = rest.max(axis=1) / RESOLVED
+    more = np.ceil(1.1 * np.nan_to_num(excess) ** (1.0 / len(GAUSS_NODES)))
+    return np.where(excess <= 1.0, 1, np.where(np.isfinite(excess), np.clip(more, 2, MOST_PARTS), 0)).astype(int)
+
+
+_TO_PROBES = interpolation(_PROBES)
 
 
 class Panels(NamedTuple):

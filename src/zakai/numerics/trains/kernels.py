@@ -22,8 +22,10 @@ from zakai.numerics.trains.grid import PAD, taps
 Array = Any
 # Times at both ends of each step (E, 2), and the given numbers there (E, 2, L).
 PATH = types.Tuple((F2, F3))
-# Centre, inverse of the basis, low, step, sizes; periods (0 or 2 pi); ranks (n + 1,), their padded values, offsets, coefficients.
-TRAIN = types.Tuple((F1, F2, F1, F1, I1, F1, I1, I1, I1, F1))
+# Centre, inverse of the basis, low, step, sizes; periods (0 or 2 pi); ranks (n + 1,), their padded values, offsets, coefficients;
+# of the Gaussian that stands for the tails the mean less the centre, the inverse of a root of the covariance, and [square of the
+# radius where it begins, largest value].
+TRAIN = types.Tuple((F1, F2, F1, F1, I1, F1, I1, I1, I1, F1, F1, F2, F1))
 # Ranks (n + 1,), sizes (n,), where each core begins (n,), and the cores in the order (N, a, b).
 PACKED = types.Tuple((I1, I1, I1, F1))
 # A train, [factor, logarithm of what it is divided by], the motion, the domain, and the path to it.
@@ -79,7 +81,7 @@ def add_train(train: Any, x: Array, moved: bool, scale: Array, out: Array) -> No
     v <- sum_d w_d(z_k) v C_k[j + d] over the axes, times scale[0] and, if moved, exp(x[n] - scale[1]); a value that is not a
     number counts as zero.
     """
-    centre, inverse, low, step, sizes, periods, ranks, padded, offsets, flat = train
+    centre, inverse, low, step, sizes, periods, ranks, padded, offsets, flat, mean, whitening, tail = train
     n, count = low.size, x.shape[1]
     width = 0
     for k in range(n + 1):
@@ -90,17 +92,22 @@ def add_train(train: Any, x: Array, moved: bool, scale: Array, out: Array) -> No
             y[d] = x[d, p] - centre[d]
             if periods[d] > 0.0:
                 y[d] -= periods[d] * math.floor(y[d] / periods[d] + 0.5)
-        inside = True
+        inside, square = True, 0.0
         for k in range(n):
-            z = 0.0
+            z, white = 0.0, 0.0
             for d in range(n):
                 z += inverse[k, d] * y[d]
+                white += whitening[k, d] * (y[d] - mean[d])
             s[k] = (z - low[k]) / step[k]
             inside = inside and s[k] > -2.9 and s[k] < sizes[k] + 1.9
-        if not inside:
+            square += white * white
+        if square > tail[0]:
+            v[0] = tail[1] * math.exp(-0.5 * square)
+        elif not inside:
             continue
-        v[0] = 1.0
-        for k in range(n):
+        else:
+            v[0] = 1.0
+        for k in range(n if square <= tail[0] else 0):
             j = int(math.floor(s[k]))
             taps(s[k] - j, w)
             a, wide = ranks[k], padded[k]

@@ -14,7 +14,18 @@ from zakai.numerics.trains.grid import Grid, after_noise, kernel_matrix, padded_
 from zakai.numerics.trains.kernels import add_train, draw, values_on_grid
 
 Array = Any
+# Share of the mass of a Gaussian beyond the radius from which it stands for the train.  There a train is below the error that it
+# has relative to its largest value: an observation six deviations away would find nothing but that error, and lose the density.
+TAIL = 1e-4
 SMALL = 1e-12  # variance of noise along an axis, in variances of the density, that is left out
+
+
+@lru_cache(maxsize=8)
+def _radius(n: int) -> float:
+    """Return the square of the radius beyond which a Gaussian of n states has the share `TAIL` of its mass."""
+    from scipy.stats import chi2
+
+    return float(chi2.isf(TAIL, n))
 
 
 @lru_cache(maxsize=8)
@@ -56,8 +67,23 @@ class Train:
         offsets = np.cumsum([0, *(part.size for part in parts)])
         return (
             grid.centre, np.ascontiguousarray(np.linalg.inv(grid.basis)), grid.low, grid.step, grid.sizes, self.periods,
-            np.array(ranks), np.array(wide), offsets, np.concatenate(parts),
+            np.array(ranks), np.array(wide), offsets, np.concatenate(parts), *self._tail,
         )  # fmt: skip
+
+    @cached_property
+    def _tail(self) -> tuple[Array, Array, Array]:
+        """The Gaussian with the moments of the train that stands for it where it is below its accuracy: see `TAIL`."""
+        n, mass = self.grid.n, self.mass
+        none = np.zeros(n), np.zeros((n, n)), np.array([np.inf, 0.0])
+        if self.grid.closed.any() or not mass > 0:
+            return none
+        mean, P = self.moments()
+        try:
+            whitening = np.linalg.inv(np.linalg.cholesky(P))
+        except np.linalg.LinAlgError:
+            return none
+        top = mass * float(np.prod(np.diag(whitening))) / (2.0 * math.pi) ** (0.5 * n)
+        return mean - self.grid.centre, np.ascontiguousarray(whitening), np.array([_radius(n), top])
 
     @cached_property
     def _packed(self) -> tuple[Any, ...]:

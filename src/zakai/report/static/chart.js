@@ -82,6 +82,7 @@ class ChartPanel extends Panel {
       for (const one of this.series) for (const key of keys) {
         for (const value of one[key]?.length ? one[key] : []) if (Number.isFinite(value)) { low = Math.min(low, value); high = Math.max(high, value); }
         if (one.kind === "area" && axis === "y") low = Math.min(low, 0);
+        if (one.kind === "row" && axis === "y" && panel.y.log) [low, high] = [Math.min(low, one.at), Math.max(high, one.at)];
       }
       if (!(low <= high)) return [0, 1];
       const margin = axis === "x" && this.series.every((one) => one.kind !== "bars") && !panel.x.log ? 0.01 * (high - low) : 0.06 * (high - low) || 0.05 * Math.abs(high);
