@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import re
+import signal
 import socket
 import subprocess
 import sys
@@ -195,7 +197,7 @@ def test_a_worker_that_the_system_ends_is_replaced(served, page: Page):
     client, _ = served
     page.send("run", text=zakai.gallery.text("lorenz"), data={"kind": "simulate", "until": 200.0, "step": 0.01, "seed": 0})
     time.sleep(0.5)
-    client.studio.runner.process.kill()
+    os.kill(client.studio.runner.process.pid, signal.SIGKILL)
     while "error" not in (answer := page.receive()):
         pass
     assert "it needed more memory than it may have" in answer["error"]
