@@ -230,7 +230,7 @@ def _fit_by_values(
 
     def result_at(theta: np.ndarray, seed: int) -> Any:
         at = model.with_parameters(**dict(zip(names, theta.tolist(), strict=True)))
-        seeds = {} if first is None else {"seed": int(first) + seed}
+        seeds: dict[str, Any] = {} if first is None else {"seed": int(first) + seed}
         return run_filter(at, record, method, keep="moments", **options, **seeds)
 
     what = f"{model.source}: fit: the search for the largest log-likelihood by {listing(names)}"

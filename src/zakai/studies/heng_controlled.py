@@ -24,8 +24,8 @@ import numpy as np
 from zakai.engine.driver import filter as filter_record
 from zakai.methods._options import whole_number
 from zakai.models.model import Model
-from zakai.models.simulate import simulate
 from zakai.records import Record
+from zakai.simulation.simulate import simulate
 from zakai.studies._drawing import INK, OURS, SERIES, new_figure, plain
 from zakai.studies._published import Comparison, Pictures, Progress, Reproduction, Table, by_computation
 
