@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
+import os
 import re
+import signal
 import socket
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
 from starlette.websockets import WebSocketDisconnect
 
 import zakai
-from studio.page import HOST, ORIGIN, PORT, Page, studio
+from studio.page import HOST, ORIGIN, PORT, Page, studio, unpacked
 from zakai.studio.follow import Source
+from zakai.studio.session import Session
+from zakai.studio.worker import answer as computed
 
 SPIRAL = zakai.gallery.text("spiral-sensor")
 SIMULATED = {"kind": "simulate", "until": 1.0, "step": 0.02, "seed": 1}
@@ -192,7 +197,7 @@ def test_a_worker_that_the_system_ends_is_replaced(served, page: Page):
     client, _ = served
     page.send("run", text=zakai.gallery.text("lorenz"), data={"kind": "simulate", "until": 200.0, "step": 0.01, "seed": 0})
     time.sleep(0.5)
-    client.studio.runner.process.kill()
+    os.kill(client.studio.runner.process.pid, signal.SIGKILL)
     while "error" not in (answer := page.receive()):
         pass
     assert "it needed more memory than it may have" in answer["error"]
@@ -249,3 +254,11 @@ def test_what_is_not_valid_on_the_command_line_is_one_line():
             command = [sys.executable, "-m", "zakai", "studio", "--no-browser", *arguments]
             done = subprocess.run(command, capture_output=True, text=True, timeout=60)
             assert done.returncode == 2 and words in done.stderr and done.stderr.count("\n") == 1
+
+
+@pytest.mark.parametrize("key", ["data", "values", "options", "text"])
+@pytest.mark.parametrize("value", [5, "x", ["a", 1], {"kind": "file", "columns": 3}, {"kind": "simulate", "inputs": "u"}])
+def test_an_address_that_holds_something_else_is_refused(key: str, value):
+    given = {"text": SPIRAL, "data": SIMULATED, "do": "run", "id": 1, key: value}
+    header = unpacked(computed(Session(Path()), given, 4.0, None))
+    assert "error" in header and "fault of zakai" not in header["error"]

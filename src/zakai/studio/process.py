@@ -143,8 +143,11 @@ class Worker:
             pass
         if process is not self.process:
             return
-        process.kill() if process.returncode is None else None
-        code = await process.wait()
+        try:
+            code = await asyncio.wait_for(process.wait(), ENOUGH)  # to kill one that has just ended would lose its code
+        except TimeoutError:
+            process.kill()
+            code = await process.wait()
         running, self.running, self.process = self.running, None, None
         if running is not None:
             await self.send(packed({"id": running.get("id"), "do": running.get("do"), "error": self._why(code)}))

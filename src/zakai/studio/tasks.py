@@ -16,6 +16,12 @@ TASKS: dict[str, Callable[..., Answer]] = {
     **exports.TASKS,
     **stream.TASKS,
 }
+# What the values of a request are: an address may hold anything.
+SHAPES: dict[str, type] = {
+    **dict.fromkeys(("data", "values", "options", "labels", "changes"), Mapping),
+    **dict.fromkeys(("names", "methods", "parameters"), list),
+    "text": str,
+}
 
 
 def carried_out(session: Session, request: Mapping[str, Any], report: Report) -> Answer:
@@ -23,4 +29,12 @@ def carried_out(session: Session, request: Mapping[str, Any], report: Report) ->
     name = str(request.get("do"))
     if name not in TASKS:
         raise InputError(f"there is no task {name[:40]!r}; reload the page")
+    wanted = request.get("data")
+    inside = dict(wanted) if isinstance(wanted, Mapping) else {}
+    simulated = inside.get("kind") != "file"
+    inside_shapes = {"columns": list, "inputs": Mapping if simulated else list}
+    for given, shapes in ((request, SHAPES), (inside, inside_shapes)):
+        for key, shape in shapes.items():
+            if given.get(key) is not None and not isinstance(given[key], shape):
+                raise InputError(f"{key}: is not what the page sends; open the page again without what follows # in its address")
     return TASKS[name](session, request, report)
