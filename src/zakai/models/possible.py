@@ -66,8 +66,9 @@ def _check_values(model: Model, t: float, u: Any) -> None:
 
 
 def _is_partial(formula: Any, model: Model) -> bool:
-    """Return whether a formula of the state may have no value."""
-    return bool(formula.free_symbols & set(model.x)) and formula.has(sp.log, sp.Pow, sp.asin, sp.acos)
+    """Return whether a formula of the state, and not of the observed path, may have no value."""
+    names = formula.free_symbols
+    return bool(names & set(model.x)) and not names & set(model.z) and formula.has(sp.log, sp.Pow, sp.asin, sp.acos)
 
 
 def _fault(model: Model, x: Any, t: float, u: Any, known: bool) -> str:
