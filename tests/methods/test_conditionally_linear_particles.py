@@ -232,3 +232,23 @@ def test_a_nonlinear_law_of_the_others_goes_with_a_filter_of_the_linear_states()
     assert np.allclose(result.mean[1:], drawn.mean[1:], atol=0.15 * np.sqrt(drawn.variance[1:].max()))
     error = np.hypot(result.log_likelihood_standard_error, drawn.log_likelihood_standard_error)
     assert abs(result.log_likelihood - drawn.log_likelihood) < 4 * error
+
+
+def test_many_observations_of_a_linear_state_act_one_after_the_other():
+    factors = [1 + i / 10 for i in range(10)]
+    seen, noise = [f"{factor}*v" for factor in factors], np.diag([0.5] * 10)
+    prior = {"kind": "gaussian", "mean": [0.0, 1.0], "cov": [0.5, 0.4]}
+    model = zakai.Model(
+        state=["u", "v"], drift=["-u", "-v"], diffusion=np.diag([1.0, 0.5]), observation=["sin(u)", *seen], **SAMPLES,
+        observation_noise=np.diag([0.3, *noise.diagonal()]), prior=prior,
+    )  # fmt: skip
+    alone = zakai.Model(
+        state=["v"], drift=["-v"], diffusion=[[0.5]], observation=seen, observation_noise=noise, **SAMPLES,
+        prior={"kind": "gaussian", "mean": [1.0], "cov": [0.4]},
+    )  # fmt: skip
+    record = record_of(model, 5)
+    result = zakai.filter(model, record, PARTICLES, particles=200)
+    exact = zakai.filter(alone, zakai.Record(record.times, record.values[:, 1:], "samples"), "kalman-bucy")
+    spread = np.sqrt(exact.variance[1:, 0])
+    assert np.all(np.abs(result.mean[1:, 1] - exact.mean[1:, 0]) < 0.02 * spread)
+    assert np.allclose(result.variance[1:, 1], exact.variance[1:, 0], rtol=0.04)

@@ -65,11 +65,15 @@ class Block(NamedTuple):
 
 
 class Updated(NamedTuple):
-    """What observations with independent noise make of the linear states: log weights, the changed mean, and the covariance."""
+    """What observations with independent noise make of the linear states: log weights, the changed mean, and the covariance.
+
+    `defined` are the formulas of the symbols that stand in these.
+    """
 
     terms: dict[int, sp.Expr]
-    mean: sp.Matrix
+    mean: list[sp.Expr]
     P: sp.Matrix
+    defined: dict[sp.Symbol, sp.Expr]
 
 
 def updated(model: Model, block: Block, numbers: Numbers, rows: list[int]) -> Updated:
@@ -79,27 +83,37 @@ def updated(model: Model, block: Block, numbers: Numbers, rows: list[int]) -> Up
     s = 1 + p q, beside it.
     """
     samples = model.observation_kind == "samples"
-    v = block.v(model)
-    moved, P, terms = sp.zeros(len(v), 1), sp.Matrix(block.P), dict[int, sp.Expr]()
+    v, defined = block.v(model), dict[sp.Symbol, sp.Expr]()
+
+    def symbol(formula: sp.Expr) -> sp.Expr:
+        if formula.is_Atom:
+            return formula
+        name = sp.Dummy(real=True)
+        defined[name] = formula
+        return name
+
+    moved, P, terms = [sp.S.Zero] * len(v), sp.Matrix(block.P), dict[int, sp.Expr]()
     fixed = not samples or not model.observation_noise.free_symbols & set(model.x)
     for j in rows:
         h = model.observation[j]
-        c = sp.Matrix([[sp.diff(h, symbol) for symbol in v]])
-        at_mean = h + (c * moved)[0]
-        p = numbers.P[j, j] if fixed else numbers.e[j] / model.observation_noise[j, j]
-        innovation = p * (numbers.z[j] - at_mean) if samples else numbers.z[j] - p * at_mean
-        across = P * c.T
-        q = (c * across)[0]
-        s = 1 + p * q
+        c = [sp.diff(h, one) for one in v]
+        at_mean = symbol(h + sum((one * change for one, change in zip(c, moved, strict=True)), sp.S.Zero))
+        p = symbol(numbers.P[j, j] if fixed else numbers.e[j] / model.observation_noise[j, j])
+        innovation = symbol(p * (numbers.z[j] - at_mean) if samples else numbers.z[j] - p * at_mean)
+        across = [symbol(sum((P[i, a] * c[a] for a in range(len(v))), sp.S.Zero)) for i in range(len(v))]
+        q = symbol(sum((one * entry for one, entry in zip(c, across, strict=True)), sp.S.Zero))
+        s = symbol(1 + p * q)
         terms[j] = q * innovation**2 / (2 * s) - sp.log(s) / 2
         if samples:
             constant = numbers.c[j] if fixed else -sp.log(2 * sp.pi * model.observation_noise[j, j]) / 2
             terms[j] += constant - p * (numbers.z[j] - at_mean) ** 2 / 2
         else:
             terms[j] += numbers.z[j] * at_mean - p * at_mean**2 / 2
-        moved = moved + across * innovation / s
-        P = P - across * across.T * p / s
-    return Updated(terms, moved, P)
+        gain = symbol(innovation / s), symbol(p / s)
+        moved = [symbol(change + entry * gain[0]) for change, entry in zip(moved, across, strict=True)]
+        for a, b in block.pairs:
+            P[a, b] = P[b, a] = symbol(P[a, b] - across[a] * across[b] * gain[1])
+    return Updated(terms, moved, P, defined)
 
 
 class ConditionalLaw(Law):
@@ -123,7 +137,7 @@ class ConditionalLaw(Law):
 
     def _formulas(self, shapes: list[sp.Expr]) -> tuple[list[sp.Expr], list[list[int]]]:
         terms, places = super()._formulas(shapes)
-        own = updated(self.model, self.block, self.numbers, self.rows).terms
+        own, _, _, self.defined = updated(self.model, self.block, self.numbers, self.rows)
         for k, place in enumerate(places):
             if place[0] in own and len(place) == 1:
                 terms[k] = own[place[0]]
@@ -174,11 +188,12 @@ class ConditionalSystem(System):
         if not self.sampled:
             plain = [numbers.z[j] * h - numbers.P[j, j] * h**2 / 2 for j, h in enumerate(model.observation) if j in rows]
             whole = self._factor() + sum(found.terms.values(), sp.S.Zero) - sum(plain, sp.S.Zero)
-            self.factor = Expressions([whole], model, known, block.symbols)
+            self.factor = Expressions([whole], model, known, block.symbols, found.defined)
         after = list(model.x)
         for i, change in zip(block.linear, found.mean, strict=True):
             after[i] += change
-        self.update = Expressions([*after, *(found.P[pair] for pair in block.pairs)], model, known, block.symbols)
+        after += [found.P[pair] for pair in block.pairs]
+        self.update = Expressions(after, model, known, block.symbols, found.defined)
 
     def widened(self, mean: Array, cov: Array) -> Array:
         """Return the covariance (n, n) of the states from that of the particles and the mean (n',) of the coordinates."""

@@ -156,7 +156,7 @@ class Advanced(NamedTuple):
 
     `gained` is the increment of the log-likelihood, `noise` (D, N) that of the interval, `predicted` (n',) the spread of the
     coordinates before the weights of the observation act, `deviations` (n,) those of the states before it, `acceptance` that of
-    moves between powers of the likelihood, `lost` the share of the particles that left every bounded set.
+    moves between powers of the likelihood; the last one is the share of the particles that left every bounded set.
     """
 
     cloud: Cloud

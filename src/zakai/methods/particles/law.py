@@ -7,7 +7,7 @@ the marks e (m,) of what is observed.  P and c are computed once for an observat
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -60,10 +60,11 @@ class Numbers(NamedTuple):
 class Law:
     """log p(z | x, u, t) as a program whose outputs are the terms of a sum, and the numbers that it needs.
 
-    `more` are the symbols of coordinates after those of the state.
+    `more` are the symbols of coordinates after those of the state, `defined` formulas for symbols that stand in others.
     """
 
     more: tuple[sp.Symbol, ...] = ()
+    defined: Mapping[sp.Symbol, sp.Expr] | None = None
 
     def __init__(self, model: Model):
         self.model, m = model, model.m
@@ -78,9 +79,8 @@ class Law:
         self.joint = model.log_density is None and self.coupled and self.fixed
         self._gaussian = [j for j in range(m) if model.observation_family[j] == "gaussian"]
         terms, self._terms = self._formulas(shapes)
-        self._expressions = Expressions(terms, model, self.numbers.symbols, self.more)
-        used = set().union(*(term.free_symbols for term in terms))
-        self.reads = np.array([symbol in used for symbol in model.x])
+        self._expressions = Expressions(terms, model, self.numbers.symbols, self.more, self.defined)
+        self.reads = np.array([self._expressions.reads(place) for place in range(model.n)])
         self.is_gaussian = model.log_density is None and set(model.observation_family) == {"gaussian"}
 
     @property

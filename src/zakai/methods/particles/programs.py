@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -35,7 +35,16 @@ class LogBessel(_Real):
 
 
 class _Instructions(Instructions):
-    """Instructions that know the functions of this module."""
+    """Instructions that know the functions of this module, and symbols that stand for a formula."""
+
+    def __init__(self, expressions: Sequence[sp.Expr], symbols: tuple[Any, ...], defined: Mapping[sp.Symbol, sp.Expr]):
+        self._defined = defined
+        # In the order of their definition, so that none is deep inside of another.
+        super().__init__([*defined, *expressions], symbols)
+        self.outputs = self.outputs[len(defined) :]
+
+    def _slot(self, expr: sp.Expr) -> int:
+        return super()._slot(self._defined.get(expr, expr))
 
     def _translate(self, expr: sp.Expr) -> tuple[str, Sequence[sp.Expr], Any]:
         special = {LogGamma: "loggamma", LogBessel: "logbessel"}
@@ -50,13 +59,19 @@ class Expressions:
         model: the model; its inputs are the first given numbers.
         given: the symbols of the given numbers after the inputs.
         more: symbols of coordinates after those of the state.
+        defined: formulas for symbols that stand in others; without them a recursion grows exponentially.
     """
 
     def __init__(
-        self, expressions: Sequence[sp.Expr], model: Model, given: Sequence[sp.Symbol] = (), more: Sequence[sp.Symbol] = ()
+        self,
+        expressions: Sequence[sp.Expr],
+        model: Model,
+        given: Sequence[sp.Symbol] = (),
+        more: Sequence[sp.Symbol] = (),
+        defined: Mapping[sp.Symbol, sp.Expr] | None = None,
     ):
         symbols = ((*model.x, *more), model.t, model.parameter_symbols, model.u, tuple(given))
-        program = _Instructions(list(expressions), symbols)
+        program = _Instructions(list(expressions), symbols, defined or {})
         inputs = len(model.u)
         self.width = inputs + len(given)
         count = len(program.instructions)
@@ -98,6 +113,10 @@ class Expressions:
             np.array(lines, np.int64).reshape(-1, 5), np.array(values + constants, float),
             np.array(coordinates + [NEITHER] * len(constants), np.int64), np.array(program.outputs, np.int64), rows, numbers,
         )  # fmt: skip
+
+    def reads(self, place: int) -> bool:
+        """Return whether the formulas contain a coordinate."""
+        return bool((self._program.coordinates == place).any())
 
     def at(self, theta: Array) -> Program:
         """Return the program for the values (p,) of the parameters."""
