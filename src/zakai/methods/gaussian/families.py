@@ -192,9 +192,7 @@ def observe_end(ends: Ends, k: int, families: Family, values: Array) -> Family:
 def step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[State, Info]:
     """Advance one interval: the transition, with the rates of y inside; what is observed at its end; normalise."""
     if is_single(prepared, state):
-        (moved,), infos = segment_of_gaussian(prepared, slice(k, k + 1), state, values[None])
-        health = {name: float(figure[0]) for name, figure in infos.health.items()}
-        return moved, Info(infos.log_likelihood_increment[0], infos.mean[0], infos.cov[0], health)
+        return step_of_gaussian(prepared, k, state, values)
     gauge, setup, inputs = prepared.gauge, prepared.setup, inputs_of(prepared, k, values)
     families = observe_end(prepared.ends, k, move_families(prepared, k, state.families, inputs), values)
     moved = State(*families, state.log_error, state.edge, float(prepared.stops[k]))
@@ -209,17 +207,36 @@ def is_single(prepared: Prepared, state: State) -> bool:
     return prepared.loop is not None and state.nodes.shape == (1, 1, 0)
 
 
-def segment_of_gaussian(prepared: Prepared, rows: slice, state: State, values: Array) -> tuple[Sequence[State], Infos]:
-    """Return the states after the intervals of a slice, and their reports, for one Gaussian."""
+def step_of_gaussian(prepared: Prepared, k: int, state: State, values: Array) -> tuple[State, Info]:
+    """Return the state after interval k, and its report, for one Gaussian: `segment_of_gaussian` for one interval, quickly."""
+    means, covs, gains = _advanced(prepared, k, state, values[None])
+    mean, cov = means[0, 0] + prepared.setup.origin, covs[0, 0]
+    variances = cov.diagonal().real.tolist()
+    negative = max(0.0, -min(variances)) / max(max(map(abs, variances)), 1e-300)
+    negative = negative if all([value == value for value in variances]) else np.nan
+    health = {"negative_variance": negative, "representation_error": 0.0, "edge_weight": 0.0, "gauge_error": 0.0}
+    after = state._replace(mean=means[0], cov=covs[0], log_mass=np.zeros(1), time=float(prepared.stops[k]))
+    return after, Info(gains[0], mean, cov, health)
+
+
+def _advanced(prepared: Prepared, first: int, state: State, values: Array) -> tuple[Array, Array, Array]:
+    """Return the means (K, 1, n), the covariances (K, 1, n, n) and the gains (K,) of the intervals from `first` on."""
     assert prepared.loop is not None
-    origin, dtype = prepared.setup.origin, prepared.loop.motion[2].dtype
+    dtype = prepared.loop.motion[2].dtype
     mean, cov = state.mean[0].astype(dtype), state.cov[0].astype(dtype)
     (count, _), n = values.shape, len(mean)
     means, covs, gains = np.empty((count, 1, n), dtype), np.empty((count, 1, n, n), dtype), np.empty(count, dtype)
-    segment(rows.start, mean, cov, *prepared.loop, np.ascontiguousarray(values), (means[:, 0], covs[:, 0], gains))
+    segment(first, mean, cov, *prepared.loop, np.ascontiguousarray(values), (means[:, 0], covs[:, 0], gains))
     gains[0] += state.log_mass[0]
+    return means, covs, gains
+
+
+def segment_of_gaussian(prepared: Prepared, rows: slice, state: State, values: Array) -> tuple[Sequence[State], Infos]:
+    """Return the states after the intervals of a slice, and their reports, for one Gaussian."""
+    means, covs, gains = _advanced(prepared, rows.start, state, values)
+    count = len(values)
     fields = {"mean": means, "cov": covs, "log_mass": np.zeros((count, 1)), "time": prepared.stops[rows].tolist()}
-    infos = Infos(gains, means[:, 0] + origin, covs[:, 0], health_of_gaussians(covs[:, 0]))
+    infos = Infos(gains, means[:, 0] + prepared.setup.origin, covs[:, 0], health_of_gaussians(covs[:, 0]))
     return StackedStates(state, fields), infos
 
 
