@@ -29,10 +29,10 @@ def save_density(density: Density, path: str | os.PathLike[str]) -> None:
     """Write a density to a file, atomically; see `Density.save`."""
     if isinstance(density, TensorTrainDensity):
         grid = density.train.grid
-        about = {"kind": "train", "names": list(density.names), "periodic": [bool(angle) for angle in density.periodic]}
+        train = {"kind": "train", "names": list(density.names), "periodic": [bool(angle) for angle in density.periodic]}
         arrays = {name: np.asarray(getattr(grid, name), float) for name in _FRAME}
         arrays |= {f"core {k}": core for k, core in enumerate(density.train.cores)}
-        write_checkpoint(path, about, arrays, KIND)
+        write_checkpoint(path, train, arrays, KIND)
         return
     found = plain(density)
     ends: dict[str, float] = {}

@@ -16,7 +16,7 @@ from zakai.numerics.trains.grid import Grid
 
 Array = Any
 # Difference of noise, in variances of the density, up to which two axes have one triangular block: at most .03, and this many
-# tolerances of a build.  What is left off the diagonal is a linear map of the frame instead of a convolution, which is wrong for
+# tolerances of a build.  Noise off the diagonal becomes a linear map of the frame instead of a convolution, which is wrong for
 # a density that is not Gaussian; with .03 alone that adds up over substeps (a robot with a wide heading: .007 deviations).
 TOGETHER, TOGETHER_TOLERANCES = 0.03, 1.0
 LEFT_OUT = 1e-3  # share of the tolerance that a box may leave out: every separated part with more mass is kept
@@ -94,7 +94,7 @@ class Rule(NamedTuple):
 
 
 def frame_of(P: Array, Q: Array | None, together: float) -> tuple[Array, Array]:
-    """Return B with B B' = P, triangular as far as the noise leaves it free, and D = B^-1 Q B^-T, nearly diagonal.
+    """Return B with B B' = P, triangular where the noise leaves it free, and D = B^-1 Q B^-T, nearly diagonal.
 
     Axes whose noise differs by less than `together` form a group, inside of which B is triangular.
     """
