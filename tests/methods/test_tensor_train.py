@@ -171,3 +171,18 @@ def test_a_fit_finds_the_maximum_by_values():
     by_values = zakai.fit(model, record, method="tensor-train", tolerance=5e-3)
     by_gradient = zakai.fit(model, record, method="yau-yau")
     assert abs(by_values.estimates["a"] - by_gradient.estimates["a"]) < 0.2 * by_gradient.standard_errors["a"]
+
+
+def test_a_density_is_saved_to_the_bit_and_is_the_prior_of_a_later_record(tmp_path):
+    model = track()
+    _, record = zakai.simulate(model, np.array([0.3, 0.7, 1.0]), seed=2)
+    whole = zakai.filter(model, record, "tensor-train")
+    density = zakai.filter(model, zakai.Record(record.times[:2], record.values[:2], "samples"), "tensor-train").density(-1)
+    density.save(tmp_path / "density")
+    read = zakai.load_density(tmp_path / "density")
+    points = density.sample(1, 100)
+    assert np.array_equal(read.log_density(points), density.log_density(points))
+    later = model.with_prior(read, start=0.7)
+    result = zakai.filter(later, zakai.Record(record.times[2:], record.values[2:], "samples"), "tensor-train")
+    deviations = np.sqrt(np.diag(whole.cov[-1]))
+    assert np.abs((result.mean[-1] - whole.mean[-1]) / deviations).max() < 0.03

@@ -16,6 +16,7 @@ from zakai.densities.mapped import MappedDensity
 from zakai.densities.particles import ParticleDensity
 from zakai.densities.points import PointMasses
 from zakai.densities.product import ProductDensity
+from zakai.densities.tensor_train import TensorTrainDensity
 from zakai.errors import InputError
 
 MOST_NUMBERS = 40_000  # of a grid, which keeps a model file with it below 1 MiB
@@ -24,6 +25,7 @@ _REACH = 9.0  # standard deviations on each side
 _RESOLVED = 1e-11  # error of the mass with every second point, at which the grid is fine enough
 _ACCEPTED = 1e-6  # at which the finest grid is taken
 MOST_KERNELS = 1000  # of a mixture that stands for particles
+KERNELS_OF_A_TRAIN = 1024
 _MOST_COMPONENTS = 64
 
 
@@ -50,6 +52,8 @@ def plain(density: Density) -> GaussianMixture | GridDensity | IntervalDensity |
         return density
     if isinstance(density, ParticleDensity | ConditionalParticleDensity):
         return density.thinned(MOST_KERNELS).smoothed
+    if isinstance(density, TensorTrainDensity) and len(density.names) > 2:
+        return density.kernels(KERNELS_OF_A_TRAIN)
     if isinstance(density, PointMasses):
         return density.smoothed
     if isinstance(density, GaussianMixture) and np.all(density.weights > 0):

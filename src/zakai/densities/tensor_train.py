@@ -11,7 +11,9 @@ import numpy as np
 
 from zakai.densities._density import DensityMethods
 from zakai.densities._values import as_states, coordinate_numbers, generator, probabilities, sample_size, wrap
+from zakai.densities.gaussian import GaussianMixture
 from zakai.densities.grid import GridDensity
+from zakai.densities.points import PointMasses
 from zakai.errors import InputError
 
 _MOST_POINTS = {1: 512, 2: 128}  # along an axis of a marginal
@@ -23,6 +25,9 @@ class Train(Protocol):
 
     @property
     def grid(self) -> Any: ...
+
+    @property
+    def cores(self) -> tuple[np.ndarray, ...]: ...
 
     @property
     def mass(self) -> float: ...
@@ -43,7 +48,8 @@ class TensorTrainDensity(DensityMethods):
     """The density u(x) / mass of a tensor train on a grid in a frame x = m + B z; outside of the grid it is zero.
 
     Moments are sums over the grid.  Marginals of one or two states are Fourier integrals of the characteristic function, which a
-    train gives at the cost of one product of small matrices for each frequency; they are densities on a grid.
+    train gives at the cost of one product of small matrices for each frequency; they are densities on a grid.  A file keeps the
+    train; a prior that is made of it, of three and more states, is a mixture of 1,024 Gaussian kernels with the same moments.
     """
 
     train: Train
@@ -95,6 +101,11 @@ class TensorTrainDensity(DensityMethods):
             length *= 1.0 if gain.any() else 0.5
         place = x[:, int(np.argmax(top))]
         return np.where(self.periodic, wrap(place), place)
+
+    def kernels(self, count: int) -> GaussianMixture:
+        """Return a mixture of Gaussian kernels around so many points, with the same mean and covariance."""
+        points, weights = self.train.cloud(count)
+        return PointMasses(weights, points.T, self.names, self.periodic).smoothed
 
     def quantile(self, q: Sequence[float]) -> np.ndarray:
         wanted = probabilities(q)

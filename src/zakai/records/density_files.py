@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 
 import numpy as np
 
-from zakai.densities import Density, GaussianMixture, GridDensity, IntervalDensity, MappedDensity
+from zakai.densities import Density, GaussianMixture, GridDensity, IntervalDensity, MappedDensity, TensorTrainDensity
 from zakai.densities.as_prior import plain
 from zakai.densities.mapped import IntervalMap
 from zakai.errors import InputError
+from zakai.numerics.trains.grid import Grid
+from zakai.numerics.trains.train import Train
 from zakai.records.checkpoint import read_checkpoint, write_checkpoint
 from zakai.records.writing import shown
 
 KIND = "density"
+_FRAME = ("centre", "basis", "low", "step", "closed")  # of the grid of a tensor train
 _PARTS = {
     "mixture": ("weights", "means", "covs"),
     "grid": ("log_values", "centre", "basis"),
@@ -23,6 +27,13 @@ _PARTS = {
 
 def save_density(density: Density, path: str | os.PathLike[str]) -> None:
     """Write a density to a file, atomically; see `Density.save`."""
+    if isinstance(density, TensorTrainDensity):
+        grid = density.train.grid
+        train = {"kind": "train", "names": list(density.names), "periodic": [bool(angle) for angle in density.periodic]}
+        arrays = {name: np.asarray(getattr(grid, name), float) for name in _FRAME}
+        arrays |= {f"core {k}": core for k, core in enumerate(density.train.cores)}
+        write_checkpoint(path, train, arrays, KIND)
+        return
     found = plain(density)
     ends: dict[str, float] = {}
     if isinstance(found, MappedDensity):
@@ -39,7 +50,7 @@ def load_density(path: str | os.PathLike[str]) -> Density:
         path: the file.
 
     Returns:
-        The density: a Gaussian mixture, or one on a grid or between the ends of a domain.
+        The density: a Gaussian mixture, a tensor train, or one on a grid or between the ends of a domain.
 
     Raises:
         InputError: the file is damaged, or holds something else.
@@ -58,6 +69,11 @@ def load_density(path: str | os.PathLike[str]) -> Density:
     damaged = InputError(f"{shown(path)}: does not hold a density; give a file that density.save wrote")
     try:
         names, periodic = tuple(about["names"]), tuple(about["periodic"])
+        if about["kind"] == "train":
+            found = _train(names, periodic, arrays)
+            if found is None:
+                raise damaged
+            return found
         parts = {name: arrays[name] for name in _PARTS[about["kind"]]}
         n, kind = len(names), about["kind"]
         ends = {name: about[name] for name in ("lower", "upper") if name in about}
@@ -94,3 +110,27 @@ def load_density(path: str | os.PathLike[str]) -> Density:
         return GaussianMixture(**parts, names=names, periodic=periodic)
     grid = GridDensity(**parts, names=names, periodic=periodic)
     return MappedDensity(grid, IntervalMap(ends.get("lower", -np.inf), ends.get("upper", np.inf))) if ends else grid
+
+
+def _train(names: tuple[str, ...], periodic: tuple[bool, ...], arrays: Mapping[str, np.ndarray]) -> TensorTrainDensity | None:
+    """Return a tensor train of its arrays, None where they do not fit together."""
+    n = len(names)
+    cores = tuple(arrays[f"core {k}"] for k in range(n))
+    frame = {name: arrays[name] for name in _FRAME}
+    fits = n > 1 and len(periodic) == n and all(isinstance(angle, bool) for angle in periodic)
+    fits &= all(isinstance(name, str) and name.isidentifier() for name in names)
+    fits &= all(array.dtype == float and np.isfinite(array).all() for array in (*cores, *frame.values()))
+    fits &= all(core.ndim == 3 and core.size > 0 for core in cores)
+    fits &= all(frame[name].shape == (n,) for name in _FRAME if name != "basis") and frame["basis"].shape == (n, n)
+    if not fits:
+        return None
+    ranks = [1, *(core.shape[2] for core in cores)]
+    if ranks[-1] != 1 or any(core.shape[0] != rank for core, rank in zip(cores, ranks[:-1], strict=True)):
+        return None
+    closed = frame["closed"] > 0
+    if (closed & ~np.array(periodic)).any() or not (frame["step"] > 0).all() or np.linalg.matrix_rank(frame["basis"]) < n:
+        return None
+    sizes = np.array([core.shape[1] for core in cores])
+    grid = Grid(frame["centre"], frame["basis"], frame["low"], frame["step"], sizes, closed)
+    train = Train(grid, cores, np.where(periodic, 2 * np.pi, 0.0))
+    return TensorTrainDensity(train, names, periodic) if train.mass > 0 else None

@@ -25,7 +25,7 @@ from zakai.methods.system.escape_of_states import check_escape
 from zakai.models.prior import DensityPrior
 from zakai.numerics.trains.train import Train, quasi_random
 
-PRIOR_POINTS = 1024
+PRIOR_POINTS, BLOCK = 1024, 1024
 AUDIT = 10  # intervals between comparisons of s and 2 s substeps, where the last one was within bounds
 # The difference of s and 2 s substeps in L1 is the error of s substeps times 3 / 4: with this share of the tolerance s are taken.
 # What is extrapolated from both has a third to a twentieth of it.
@@ -77,7 +77,23 @@ def _mixture(prepared: Prepared, prior: Any) -> tuple[Callable[[Array], Array], 
     turns = itertools.product(*[(-2 * np.pi, 0.0, 2 * np.pi) if angle else (0.0,) for angle in angles])
     images = [np.array(turn) for turn in turns]
 
+    alike = len(weights) > 16 and all(np.array_equal(cov, covs[0]) for cov in covs)
+    centres = inverses[0] @ means.T
+
+    def of_kernels(x: Array) -> Array:
+        """Return the density of many components with one covariance."""
+        total = np.zeros(x.shape[1])
+        for image in images:
+            white = inverses[0] @ (x + image[:, None])
+            for first in range(0, x.shape[1], BLOCK):
+                part = white[:, first : first + BLOCK]
+                squares = (part**2).sum(axis=0)[:, None] - 2.0 * part.T @ centres + (centres**2).sum(axis=0)
+                total[first : first + BLOCK] += np.exp(-0.5 * squares) @ np.array(factors)
+        return total
+
     def density(x: Array) -> Array:
+        if alike and not angles.any():
+            return of_kernels(x)
         total = np.zeros(x.shape[1])
         for factor, mean, inverse in zip(factors, means, inverses, strict=True):
             apart = x - mean[:, None]
@@ -87,7 +103,7 @@ def _mixture(prepared: Prepared, prior: Any) -> tuple[Callable[[Array], Array], 
                 total += factor * np.exp(-0.5 * ((inverse @ (apart + image[:, None])) ** 2).sum(axis=0))
         return total
 
-    count = max(64, PRIOR_POINTS // len(weights))
+    count = max(4, PRIOR_POINTS // len(weights))
     normal = ndtri(np.clip(quasi_random(count, n), 1e-9, 1 - 1e-9))
     points = np.concatenate([mean[:, None] + root @ normal for mean, root in zip(means, roots, strict=True)], axis=1)
     return density, Mass(points, np.repeat(weights / weights.sum() / count, count))

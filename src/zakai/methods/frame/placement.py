@@ -16,7 +16,7 @@ from zakai.numerics.trains.grid import Grid
 
 Array = Any
 # Difference of noise, in variances of the density, up to which two axes have one triangular block: at most .03, and this many
-# tolerances of a build.  The noise off the diagonal is a linear map of the frame instead of a convolution, which is wrong for
+# tolerances of a build.  Noise off the diagonal becomes a linear map of the frame instead of a convolution, which is wrong for
 # a density that is not Gaussian; with .03 alone that adds up over substeps (a robot with a wide heading: .007 deviations).
 TOGETHER, TOGETHER_TOLERANCES = 0.03, 1.0
 LEFT_OUT = 1e-3  # share of the tolerance that a box may leave out: every separated part with more mass is kept
