@@ -84,6 +84,15 @@ def test_the_methods_of_the_reference_are_those_that_exist():
     assert [row[0] for row in table("docs/reference/methods.md", "method")] == list(_registry.METHODS)
 
 
+def test_every_model_of_the_gallery_has_its_picture_in_the_reference():
+    page = (ROOT / "docs/reference/gallery.md").read_text()
+    parts = dict(part.split("\n", 1) for part in page.split("\n## ")[1:])
+    assert list(parts) == list(zakai.gallery.names())
+    for name, part in parts.items():
+        assert zakai.gallery.describe(name) in part
+        assert f'picture("{name}", ' in part or f'structure("{name}")' in part
+
+
 MODEL = blocks("docs/reference/model-file.md", "toml")[0].code
 
 

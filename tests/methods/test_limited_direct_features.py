@@ -93,3 +93,22 @@ def test_rounding_that_a_gauge_lifts_far_out_is_not_followed_there():
         u /= u.sum()
         np.testing.assert_allclose(found, (grid * u).sum(axis=(1, 2)), atol=1e-7)
     assert result.warnings == []
+
+
+@pytest.mark.parametrize("family", ["gaussian", "bernoulli", "poisson"])
+@pytest.mark.parametrize("method", ["limited-direct", "general-direct", "gaussian-sum", "yau-yau"])
+def test_an_observation_of_an_input_alone_leaves_the_density_to_its_motion(family, method):
+    model = zakai.Model(
+        state=["x"], drift=["-x"], inputs=["u"], observation=["u"], observation_kind="samples", observation_family=family,
+        prior={"kind": "gaussian", "mean": [0.5], "cov": [[0.1]]},
+    )  # fmt: skip
+    inputs = zakai.Inputs([0, 0.15], [[0.1], [0.2]])
+    result = zakai.filter(model, zakai.Record([0.1, 0.2], [1, 0], "samples", inputs=inputs), method)
+    decay = np.exp(-0.2)
+    assert result.mean[-1, 0] == pytest.approx(0.5 * decay, abs=1e-5)
+    assert result.variance[-1, 0] == pytest.approx(0.1 * decay**2 + (1 - decay**2) / 2, abs=1e-5)
+    laws = {
+        "gaussian": -0.5 * (0.9**2 + 0.2**2) - np.log(2 * np.pi), "bernoulli": np.log(0.1) + np.log(0.8),
+        "poisson": np.log(0.1) - 0.1 - 0.2,
+    }  # fmt: skip
+    assert result.log_likelihood == pytest.approx(laws[family], abs=1e-5)

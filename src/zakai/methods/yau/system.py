@@ -30,7 +30,8 @@ class YauSystem:
         slope = yau.slope if self.affine else sp.zeros(m, n)
         intercept = yau.intercept if self.affine else sp.zeros(m, 1)
         blocks = [yau.form.matrix, yau.form.offset, model.covariance]
-        for quadratic in (yau.unobserved or yau.full, yau.full or yau.unobserved):
+        full = yau.unobserved if model.observation_kind == "samples" else yau.full  # a sample acts at its time alone
+        for quadratic in (yau.unobserved or yau.full, full or yau.full or yau.unobserved):
             assert quadratic is not None
             blocks += [quadratic.matrix, quadratic.linear, sp.Matrix([quadratic.constant])]
         if n == 1 and (model.drift.has(model.t) or model.covariance.has(model.t)):

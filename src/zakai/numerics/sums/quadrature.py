@@ -91,7 +91,7 @@ def equidistant(size: int, spacing: float, directions: int) -> Rule:
 
 
 def _tensor(node: Array, weight: Array, directions: int) -> Rule:
-    nodes = np.array(list(tuples(node, repeat=directions))).reshape(-1, directions)
+    nodes = np.array(list(tuples(node, repeat=directions))).reshape(len(node) ** directions, directions)
     weights = np.array([np.prod(w) for w in tuples(weight, repeat=directions)])
     return Rule(nodes, weights, len(node))
 
