@@ -151,7 +151,7 @@ class Worker:
         running, self.running, self.process = self.running, None, None
         if running is not None:
             await self.send(packed({"id": running.get("id"), "do": running.get("do"), "error": self._why(code)}))
-        await self._next()  # another process begins with the next request: one that fails at its start is not begun again and again
+        await self._next()  # another process begins with the next request: a process that fails at its start is not begun again
 
     def _why(self, code: int) -> str:
         if code in (-9, -11, -6):
