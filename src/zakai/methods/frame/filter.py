@@ -169,7 +169,7 @@ def _step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[Stat
     updated = update(builder, prediction, prepared.motion.likelihood(interval, values))
     v, rule = updated.density, builder.rule
     mean, cov = v.moments(direction_of(prepared, v))
-    depth = depth_of(prediction.function, prediction.mass, v)
+    depth = depth_of(updated.prediction, prediction.mass, v)
     reports = builder.reports
     off_grid, edge = sum(report.off_grid for report in reports), max(report.edge for report in reports)
     # Errors of different builds have different signs; the error of a mean is about half of the error in L1 at most.

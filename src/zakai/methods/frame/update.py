@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -23,12 +24,13 @@ OFF_CENTRE, NARROW, WIDE = 0.5, 0.6, 1.6  # shift and deviation of a density in 
 
 
 class Updated(NamedTuple):
-    """A density of mass one, the log of the evidence, the share of the points that the likelihood left, and the powers taken."""
+    """A density of mass one, the log of the evidence, the share of the points left, the powers taken, and the prediction used."""
 
     density: Train
     log_evidence: float
     effective: float
     powers: int
+    prediction: Carried
 
 
 def update(builder: Builder, prediction: Prediction, likelihood: Likelihood) -> Updated:
@@ -45,6 +47,9 @@ def update(builder: Builder, prediction: Prediction, likelihood: Likelihood) -> 
         raise Unresolved("the observation is impossible everywhere in the predicted density")
     effective = mass.reweighted(logs).effective / mass.effective
     done, powers = 0.0, 0
+    if mass.reweighted(_finite(logs)).effective < FEW:
+        # The likelihood is sharp or distant: it may need the tails.
+        prediction = replace(prediction, function=prediction.function.with_tails())
     loose = max(1.0, ROUGHLY / builder.rule.tolerance)
     while mass.reweighted((1.0 - done) * _finite(logs)).effective < FEW and powers < MOST_POWERS:
         power = min(done + (1.0 - done) * _power(mass, (1.0 - done) * _finite(logs)), 1.0)
@@ -81,7 +86,7 @@ def _normalised(v: Train, prediction: Prediction, top: float, effective: float, 
     if not total > 0 or not math.isfinite(total):
         raise Unresolved(f"the density has mass {total:.1g} after the observation")
     log_evidence = math.log(total) + top + prediction.log_scale
-    return Updated(v.scaled(1.0 / total), log_evidence, effective, powers)
+    return Updated(v.scaled(1.0 / total), log_evidence, effective, powers, prediction.function)
 
 
 def _off_centre(v: Train) -> bool:

@@ -72,6 +72,11 @@ class Carried:
         """Return the same density times another likelihood."""
         return replace(self, likelihood=likelihood)
 
+    def with_tails(self) -> Carried:
+        """Return the same density with Gaussian tails."""
+        terms = (term._replace(density=replace(term.density, tails=True)) for term in self.terms)
+        return replace(self, terms=tuple(terms))
+
     def about(self, turn: Array) -> Carried:
         """Return the same density with angles on another turn."""
         return replace(self, turn=turn)

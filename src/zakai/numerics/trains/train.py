@@ -38,11 +38,15 @@ def quasi_random(count: int, n: int) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Train:
-    """A function on a `grid` by its `cores` (a, N, b); `periods` (n,) are 2 pi for angles and 0 for other states."""
+    """A function on a `grid` by its `cores` (a, N, b); `periods` (n,) are 2 pi for angles and 0 for other states.
+
+    With `tails` a Gaussian stands for it where it is below its accuracy: see `TAIL`.
+    """
 
     grid: Grid
     cores: tuple[Array, ...]
     periods: Array
+    tails: bool = False
 
     @property
     def ranks(self) -> list[int]:
@@ -75,7 +79,7 @@ class Train:
         """The Gaussian with the moments of the train that stands for it where it is below its accuracy: see `TAIL`."""
         n, mass = self.grid.n, self.mass
         none = np.zeros(n), np.zeros((n, n)), np.array([np.inf, 0.0])
-        if self.grid.closed.any() or not mass > 0:
+        if not self.tails or self.grid.closed.any() or not mass > 0:
             return none
         mean, P = self.moments()
         try:
