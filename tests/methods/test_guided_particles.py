@@ -335,3 +335,12 @@ def test_particles_far_out_in_a_stiff_drift_are_not_thrown_to_infinity():
     predicted, known = ours.predict_observations(), exact.predict_observations()
     assert np.allclose(predicted.mean, known.mean, atol=0.05)
     assert np.allclose(predicted.quantile([0.1, 0.9]), known.quantile([0.1, 0.9]), atol=0.1)
+
+
+def test_a_coefficient_that_never_changes_is_named_where_the_record_is_longer_than_the_past():
+    model = zakai.Model(
+        state=["x", "b"], drift=["b - 0.5*x", "0"], diffusion=[["0.2"], ["0"]], observation=["x"], observation_kind="samples",
+        observation_noise=[["0.04"]], prior={"kind": "gaussian", "mean": [0.0, 0.0], "cov": [1.0, 1.0]},
+    )  # fmt: skip
+    record = record_of(model, 66, 0.1, gaps=False)
+    assert any("b never changes" in line for line in zakai.filter(model, record, PARTICLES, particles=50).warnings)

@@ -18,7 +18,9 @@ from zakai.methods.particles.filter import MOST_GROWTH, VARIANCE, init, reduced
 from zakai.methods.particles.split import split_of
 from zakai.methods.particles.state import Prepared, Rule, State
 from zakai.methods.particles.system import System, system_of
+from zakai.methods.particles.window import INTERVALS
 from zakai.models import features
+from zakai.models._errors import listing
 from zakai.models.model import Model
 from zakai.numerics.complex_step import is_complex
 from zakai.records.schedule import Schedule
@@ -65,7 +67,21 @@ def prepare(
         count = min(int(np.ceil(VARIANCE / tolerance**2)), most)
         rule = Rule(count, min(most, MOST_GROWTH * count), tolerance, seed, split is True)
     assert not is_complex(theta)
-    return Prepared(_system(model, split), np.asarray(theta, float), schedule, rule)
+    return Prepared(_system(model, split), np.asarray(theta, float), schedule, rule, _notes(model, len(schedule)))
+
+
+def _notes(model: Model, intervals: int) -> tuple[str, ...]:
+    """Return a sentence where states never change and the record is longer than the past that is kept."""
+    constant = [
+        name for i, name in enumerate(model.state)
+        if model.drift[i].is_zero and all(entry.is_zero for entry in model.diffusion[i, :])
+    ]  # fmt: skip
+    if not constant or intervals <= INTERVALS:
+        return ()
+    return (
+        f"{listing(constant)} never changes: its particles are moved for at most {INTERVALS} intervals, and in a record of "
+        f"{intervals} its error grows after that; give it a small noise, or compare seeds",
+    )
 
 
 def _system(model: Model, split: object) -> System:
