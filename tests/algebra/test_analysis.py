@@ -118,4 +118,4 @@ def test_latex_has_the_certificate_in_words_that_latex_takes_for_words():
 
 def test_an_analysis_shows_what_auto_takes_and_how_many_methods_hold():
     text = repr(zakai.analyze(zakai.load_model("gallery:benes")))
-    assert text == "Analysis('Benes', state x: auto takes benes; the conditions hold for 10 of 12 methods)"
+    assert text == "Analysis('Benes', state x: auto takes benes; the conditions hold for 10 of 13 methods)"

@@ -34,9 +34,13 @@ def distances(setting: Setting, mean: Array, cov: Array, again: Callable[[Settin
 
     Returns:
         The largest relative difference of a mean or a deviation; infinite after the coarser run has lost the density. None where
-        the method has no tolerance, or the coarsest.
+        the method has no tolerance, or the coarsest, and where another option is given: it may set an error that no tolerance
+        changes.
     """
     if "tolerance_ratio" not in setting.method.bounds or "tolerance" not in setting.options:
+        return None
+    defaults = setting.method.options
+    if any(value != defaults.get(name) for name, value in setting.options.items() if name != "tolerance"):
         return None
     own = setting.options["tolerance"] or 0.0
     tolerance = COARSE if own < COARSE else min(TIMES * own, COARSEST)
