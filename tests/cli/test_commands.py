@@ -81,6 +81,13 @@ def test_methods_of_a_record_adds_the_expected_time_of_those_that_hold(zakai):
     assert wrong.code == 2 and "nowhere.csv" in wrong.err
 
 
+def test_the_methods_of_a_record_take_its_columns(zakai, tmp_path):
+    rows = [line.split(",") for line in (tmp_path / "record.csv").read_text().split()]
+    (tmp_path / "wide.csv").write_text("\n".join(f"{row[0]},{'other' if k == 0 else 7},{row[1]}" for k, row in enumerate(rows)))
+    assert zakai("methods", "model.toml", "wide.csv").code == 2
+    assert "for this record" in zakai("methods", "model.toml", "wide.csv", "--columns", rows[0][1]).out
+
+
 def test_methods_lists_every_method_and_says_which_hold(zakai):
     assert all(name in zakai("methods").out for name in (*_registry.METHODS, *_registry.AUTO))
     answer = zakai("methods", "gallery:cubic-sensor").out

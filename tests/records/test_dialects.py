@@ -22,6 +22,8 @@ ROWS = np.array([[0.5, 1.25, -3.0], [1.0, np.nan, 0.002], [1.5, 7.0, np.nan]])
         "time;range;bearing\r\n0.5;1.25;-3\r\n1;NA;0,002\r\n1.5;7;null\r\n",
         "time\trange\tbearing\n0.5\t1.25\t-3\n1\t\t0.002\n1.5\t7\tNA\n",
         "Time,range,bearing\n0.5,1.25,-3\n1,NA,2e-3\n1.5,7,N/A\n",
+        "Time [s],range,bearing\n0.5,1.25,-3\n1,NA,2e-3\n1.5,7,N/A\n",
+        "t (h);range;bearing\n0,5;1,25;-3\n1;NA;0,002\n1,5;7;N/A\n",
         ",time,range,bearing\n0,0.5,1.25,-3\n1,1,NA,2e-3\n2,1.5,7,\n",
         "index;Time;bearing;range\n0;0,5;-3;1,25\n1;1;0,002;\n2;1,5;NA;7\n",
         "# a logger\n# 3 rows\n\ntime,range,bearing\n0.5,1.25,-3\n# a pause\n1,,2e-3\n1.5,7,\n",

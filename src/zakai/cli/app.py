@@ -188,11 +188,15 @@ def methods(
     model: Annotated[str | None, typer.Argument(metavar="MODEL", help="Print which hold for this model.")] = None,
     record: Annotated[Path | None, typer.Argument(metavar="RECORD", help="Add how long those take for this record.")] = None,
     inputs: _Inputs = None,
+    unit: _Unit = None,
+    origin: _Origin = None,
+    columns: _Columns = "",
 ) -> None:
     """List the methods; for a model, print whether each holds; for a record, how long those take that hold."""
     from zakai.cli import inspecting
 
-    inspecting.methods(model, record, inputs)
+    given = None if record is None else inspecting.RecordFile(record, inputs, unit, origin, columns)
+    inspecting.methods(model, given)
 
 
 @app.command("warm-up")

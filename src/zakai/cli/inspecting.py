@@ -5,7 +5,7 @@ from __future__ import annotations
 import textwrap
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from zakai import _registry
 from zakai.errors import InputError, ZakaiError
@@ -28,7 +28,17 @@ def analyze(source: str, json: bool, latex: bool) -> None:
     print(analysis.to_json() if json else analysis.to_latex() if latex else analysis)
 
 
-def methods(source: str | None, record_path: Path | None = None, inputs_path: Path | None = None) -> None:
+class RecordFile(NamedTuple):
+    """The file of a record, and how it is read."""
+
+    path: Path
+    inputs: Path | None = None
+    unit: str | None = None
+    origin: str | None = None
+    columns: str = ""
+
+
+def methods(source: str | None, given: RecordFile | None = None) -> None:
     """Print the methods and, for a model, whether each holds and what fails; for a record, how long those take that hold."""
     if source is None:
         _columns([(name, entry.summary) for name, entry in _registry.METHODS.items()])
@@ -41,7 +51,7 @@ def methods(source: str | None, record_path: Path | None = None, inputs_path: Pa
     from zakai.models.files import load_model
 
     model = load_model(source)
-    record = None if record_path is None else _record(record_path, model, inputs_path)
+    record = None if given is None else _record(given, model)
     analysis = analyze(model)
     rows, ends = [], time.monotonic() + MOST_SECONDS
     for name, conditions in analysis.methods.items():
@@ -76,11 +86,11 @@ def _split(model: Model) -> str:
     return f"; each particle carries the mean and the covariance of {', '.join(linear)} given {given}{unless}"
 
 
-def _record(path: Path, model: Model, inputs_path: Path | None) -> Record:
+def _record(given: RecordFile, model: Model) -> Record:
     """Read a record with its inputs."""
     from zakai.cli.filtering import record_with_inputs
 
-    return record_with_inputs(path, model, inputs_path)
+    return record_with_inputs(given.path, model, given.inputs, given.unit, given.origin, given.columns)
 
 
 def _expected(model: Model, record: Record, name: str, ends: float) -> str:

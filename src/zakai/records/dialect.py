@@ -17,6 +17,7 @@ _OTHERS = {"|": "a bar", " ": "a space", ":": "a colon"}
 _MISSING = re.compile(r'(^|,)\s*"?(?:NA|N/A|n/a|na|null|NULL|None|<NA>|#N/A)"?\s*(?=,|$)')
 _DECIMAL_COMMA = re.compile(r"[+-]?(\d+,\d*|,\d+)(e[+-]?\d+)?", re.IGNORECASE)
 TIMES = ("time", "t")  # names of the first column: `t` is the time in formulas too
+_UNIT = re.compile(r"\s*(\[[^]]*\]|\([^)]*\))\s*$")  # behind a name, as in "Time [s]"
 _ROW_NUMBERS = ("", "index", "unnamed: 0")  # names of a column of row numbers before the time
 
 
@@ -63,7 +64,7 @@ def dialect_of(lines: Sequence[str]) -> Dialect | None:
             continue
         if comment and NUMBER.fullmatch(_split(line, _separator(line))[0].replace(",", ".")):
             header = lines[comment - 1].lstrip().lstrip("#").strip()
-            if _split(header, _separator(header))[0].strip().lower() in TIMES:
+            if _is_time(_split(header, _separator(header))[0]):
                 return _of_header(header, comment)
         return _of_header(line, place + 1)
     return None
@@ -77,15 +78,20 @@ def other_separator(name: str) -> str:
     return ""
 
 
+def _is_time(cell: str) -> bool:
+    """Return whether a cell of a header names the time, with or without a unit."""
+    return _UNIT.sub("", cell.strip().strip('"')).lower() in TIMES
+
+
 def _of_header(header: str, line: int) -> Dialect:
     separator = _separator(header)
     cells = [cell.strip() for cell in _split(header, separator)] if separator != "," else []
     text = ",".join(_quoted(cell) for cell in cells) if cells else header
     first, _, rest = text.partition(",")
-    numbered = first.strip().strip('"').lower() in _ROW_NUMBERS and rest.partition(",")[0].strip().strip('"').lower() in TIMES
+    numbered = first.strip().strip('"').lower() in _ROW_NUMBERS and _is_time(rest.partition(",")[0])
     text = rest if numbered else text
     first, comma, rest = text.partition(",")
-    text = f"time{comma}{rest}" if first.strip().strip('"').lower() in TIMES else text
+    text = f"time{comma}{rest}" if _is_time(first) else text
     return Dialect(separator, numbered, text, line)
 
 
