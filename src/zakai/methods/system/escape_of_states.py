@@ -19,6 +19,7 @@ DIRECTIONS = 64
 CALM = 5.0, 2.5  # standard deviations of the prediction: where the drift is seen, and how far it may move a path
 SAMPLES = 256  # points of the density among which poles are sought
 FAR_OUT = 1e3  # standard deviations that show which states escape
+DOUBTFUL = "the density of the interval before is wrong, and guided-particles gives another one"
 
 
 class Interval(NamedTuple):
@@ -124,7 +125,8 @@ def _check_infinity(interval: Interval, mean: Array, cov: Array) -> None:
         worst = int(np.argmax(np.where(np.isnan(drift), np.inf, drift)))
         apart = np.abs(place - mean) / np.sqrt(np.diagonal(cov))
         names = [name for name, far in zip(model.state, apart, strict=True) if not far < FAR_OUT] or list(model.state)
-        raise interval.error(infinite_text(model, worst, ", ".join(names), share))
+        text = infinite_text(model, worst, ", ".join(names), share)
+        raise interval.error(text if interval.row == 0 else f"{text}; or {DOUBTFUL}")
 
 
 def _check_poles(interval: Interval, points: Array, divisors: Array) -> None:
