@@ -95,7 +95,8 @@ def _blocks(doctree: nodes.document) -> Iterator[tuple[nodes.Element, str, str, 
 
 
 def _title(figure: Any) -> str:
-    title = figure.get_suptitle() or next((text for axes in figure.axes for at in ("center", "left") if (text := axes.get_title(loc=at))), "")
+    titles = (axes.get_title(loc=at) for axes in figure.axes for at in ("center", "left"))
+    title = figure.get_suptitle() or next((text for text in titles if text), "")
     if not title:
         raise ValueError("a figure needs a title, which is its alternative text")
     return str(title)
