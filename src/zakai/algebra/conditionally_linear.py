@@ -124,9 +124,9 @@ def _excluded(model: Model) -> Iterator[tuple[int, str]]:
         if name in model.periodic or name in model.domain:
             yield i, f"{name} is an angle" if name in model.periodic else f"{name} has a domain"
             continue
-        reading = next((one for one in free if symbol in one.symbols), None)
-        if reading is not None:
-            yield i, f"{reading.name} depends on {name}"
+        dependent = next((one for one in free if symbol in one.symbols), None)
+        if dependent is not None:
+            yield i, f"{dependent.name} depends on {name}"
             continue
         curved = next((one for one in affine if symbol in one.symbols and not _is_affine(one.formula, symbol)), None)
         if curved is not None:
