@@ -1,15 +1,20 @@
 """The expected time of a record: measured on its first observations, within bounds of its own."""
 
+import gc
 import threading
 import time
 from contextlib import nullcontext
+from typing import Any
 
 import numpy as np
 import pytest
+from numba import float64
 
 import zakai
 from zakai.diagnostics import expected_time
 from zakai.diagnostics.expected_time import Expected, expected_seconds
+from zakai.errors import ZakaiError
+from zakai.numerics.compiled import kernel
 
 PENDULUM = zakai.load_model("gallery:pendulum")
 
@@ -61,6 +66,18 @@ def test_a_slow_first_observation_gives_a_lower_bound(monkeypatch, interrupted):
         thread.start()
         thread.join()
         assert isinstance(found[0], AssertionError)
+
+
+def test_a_kernel_is_compiled_to_its_end():
+    loop = "    for k in range(9):\n        y += np.sin(y) / (k + y * y)\n"
+    source = "def inner(x):\n    y = x\n" + 60 * loop + "    return y\n"
+    names: dict[str, Any] = {"np": np}
+    exec(source, names)  # without a file, so that it is not read from a cache
+    compiled: Any = kernel(float64(float64))(names["inner"])
+    with pytest.raises(ZakaiError, match="more than 0.01 s"), expected_time._at_most(0.01):
+        compiled(1.0)
+        time.sleep(2.0)
+    assert len(compiled.signatures) == 1 and gc.isenabled()
 
 
 def test_blocks_add_their_times_and_the_record_is_not_filtered_as_a_whole(monkeypatch):

@@ -17,11 +17,12 @@ from zakai.engine.plan import plan_of
 from zakai.engine.setting import Setting
 from zakai.errors import ZakaiError
 from zakai.models.model import Model
-from zakai.numerics.compiled import working_time
+from zakai.numerics.compiled import compiling, working_time
 from zakai.records import Record
 from zakai.records.schedule import Schedule
 
 ENOUGH, LOADED = 0.8, 0.2  # seconds of observations from which the others are extrapolated, and of those before
+AGAIN = 0.02  # seconds after which it is seen again whether a kernel has been compiled
 FEW, MORE, MOST = 2, 16, 128  # intervals that are prepared to see what each of them costs; and filtered, at most
 
 
@@ -151,13 +152,19 @@ def _preparation(setting: Setting, schedule: Schedule) -> tuple[float, float]:
 
 @contextmanager
 def _at_most(seconds: float) -> Iterator[None]:
-    """Raise _LateError after some seconds, in the main thread of a system with interval timers; never elsewhere."""
+    """Raise _LateError after some seconds, in the main thread of a system with interval timers; never elsewhere.
+
+    A kernel that is then compiled is completed first.
+    """
     timers = hasattr(signal, "setitimer") and threading.current_thread() is threading.main_thread()
     if not timers or signal.getitimer(signal.ITIMER_REAL)[0] > 0.0:
         yield
         return
 
     def late(*_: Any) -> None:
+        if compiling():
+            signal.setitimer(signal.ITIMER_REAL, AGAIN)
+            return
         raise _LateError(f"more than {seconds:g} s")
 
     before = signal.signal(signal.SIGALRM, late)

@@ -93,6 +93,11 @@ def compilation_time() -> float:
     return _compilation.seconds()
 
 
+def compiling() -> bool:
+    """Return whether this thread compiles a kernel. Numba must not be interrupted there: it would keep what is half done."""
+    return bool(global_compiler_lock.is_locked())
+
+
 def working_time() -> float:
     """Return a clock in seconds that does not count the compilation of kernels."""
     return time.monotonic() - _compilation.seconds()
