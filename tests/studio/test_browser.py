@@ -14,6 +14,7 @@ import pytest
 from playwright.sync_api import Browser, Page, expect, sync_playwright
 
 import zakai
+from zakai.records import write_truth
 
 PATIENCE = 240_000  # milliseconds: the first run of a machine compiles kernels
 
@@ -86,8 +87,9 @@ def test_a_model_of_the_gallery_is_loaded_and_a_record_of_the_user_filtered(page
     expect_status(page, "Filtered")
     before = picture(page)
     model = zakai.gallery.load("cubic-sensor")
-    _, record = zakai.simulate(model, [0.1 * k for k in range(1, 41)], seed=3)
+    truth, record = zakai.simulate(model, [0.1 * k for k in range(1, 41)], seed=3)
     record.to_csv(tmp_path / "mine.csv", ["voltage"])
+    write_truth(tmp_path / "truth.csv", truth, model.state)
     page.get_by_test_id("data-file").click()
     page.get_by_test_id("record-file").set_input_files(tmp_path / "mine.csv")
     expect(page.locator("#data-said")).to_contain_text("mine.csv, 40 rows")
@@ -95,6 +97,12 @@ def test_a_model_of_the_gallery_is_loaded_and_a_record_of_the_user_filtered(page
     expect_another_picture(page, before)
     expected = zakai.filter(model, zakai.read_record(tmp_path / "mine.csv", model)).log_likelihood
     assert float(likelihood(page).replace("−", "-")) == pytest.approx(expected, rel=1e-6)
+    before = picture(page)
+    page.get_by_test_id("truth-file").set_input_files(tmp_path / "mine.csv")  # not its true states
+    expect(page.get_by_test_id("data-error")).to_contain_text("mine.csv")
+    page.get_by_test_id("truth-file").set_input_files(tmp_path / "truth.csv")
+    expect(page.get_by_test_id("data-error")).to_be_hidden()
+    expect_another_picture(page, before)
 
 
 def test_the_density_follows_a_slider_while_it_is_dragged_and_is_filtered_again_when_it_is_released(page: Page):

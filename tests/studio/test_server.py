@@ -112,7 +112,7 @@ def test_an_upload_is_bounded_and_a_bad_one_is_one_message(page: Page):
         said = page.ask("columns", **data).get("error") or page.ask("describe", text=SPIRAL, data=data)["error"]
         assert said.startswith("mine.csv") and "\n" not in said
     other = {"kind": "file", "file": "../../etc/passwd"}
-    assert "drop the file again" in page.ask("describe", text=SPIRAL, data=other)["error"]
+    assert "drop it again" in page.ask("describe", text=SPIRAL, data=other)["error"]
 
 
 def test_a_record_of_a_file_is_filtered_as_by_the_library(page: Page, tmp_path):
@@ -239,6 +239,49 @@ def test_the_script_of_a_record_from_a_file_computes_the_same(page: Page, tmp_pa
     stored = page.ask("export", what="result.nc", name="main")["bytes"].tobytes()
     (tmp_path / "stored.nc").write_bytes(stored)
     assert zakai.load_result(tmp_path / "stored.nc").log_likelihood == answer["log_likelihood"]
+
+
+ROOM = zakai.gallery.text("heated-room")
+
+
+@pytest.mark.parametrize("simulated", [True, False])
+def test_a_record_with_known_inputs_is_taken_away_whole(page: Page, tmp_path, simulated: bool):
+    if simulated:
+        data = {"kind": "simulate", "until": 3.0, "step": 0.5, "seed": 4, "inputs": {"heater": 1.5, "outdoor": -2}}
+    else:
+        rows = "time,outdoor,indoor,heater\n0.5,-2,19.5,1\n1,,19,\n1.5,-1,,0.5\n2.25,-1.5,18.5,2\n"
+        number = page.upload(rows.encode()).json()["file"]
+        data = {"kind": "file", "file": number, "name": "room.csv", "columns": ["indoor"], "inputs": ["heater", "outdoor"]}
+    answer = page.ask("run", text=ROOM, data=data, name="main")
+    assert "error" not in answer, answer
+    (tmp_path / "model.toml").write_text(ROOM)
+    (tmp_path / "record.csv").write_bytes(page.ask("export", what="record.csv", text=ROOM, data=data)["bytes"].tobytes())
+    model = zakai.load_model(tmp_path / "model.toml")
+    again = zakai.filter(model, zakai.read_record(tmp_path / "record.csv", model))
+    assert again.log_likelihood == answer["log_likelihood"]
+    (tmp_path / "filter.py").write_bytes(page.ask("export", what="filter.py", text=ROOM, data=data)["bytes"].tobytes())
+    done = subprocess.run([sys.executable, "filter.py"], cwd=tmp_path, capture_output=True, text=True, check=True)
+    assert f"log-likelihood {answer['log_likelihood']!r}" in done.stdout
+    lines = page.ask("shell", text=ROOM, data=data)["text"]
+    done = subprocess.run(lines, cwd=tmp_path, shell=True, capture_output=True, text=True, check=True, env=shell_environment())
+    assert zakai.load_result(tmp_path / "result.nc").log_likelihood == answer["log_likelihood"]
+
+
+def shell_environment() -> dict[str, str]:
+    """An environment in which `zakai` is the command of this interpreter."""
+    return {**os.environ, "PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"}
+
+
+def test_true_states_of_a_file_are_shown_and_wrong_ones_are_one_line(page: Page):
+    text = zakai.gallery.text("kalman-bucy-1d")
+    number = page.upload(b"time,y\n0.5,0.1\n1.25,\n2,-0.3\n").json()["file"]
+    truths = [b"time,x\n0,0.1\n0.5,0.2\n1.25,0.3\n2,0.2\n", b"time,x\n9,0.1\n", b"time,z\n0.5,0.1\n"]
+    for truth, wrong in zip(truths, ["", "none of its times", "t.csv"]):
+        named = {"file": page.upload(truth).json()["file"], "name": "t.csv"}
+        data = {"kind": "file", "file": number, "name": "mine.csv", "truth": named}
+        answer = page.ask("run", text=text, data=data, name="main")
+        assert answer["truth"] if not wrong else wrong in answer["error"] and "\n" not in answer["error"]
+        assert ".csv:" not in answer.get("error", "").replace("t.csv", "")
 
 
 def test_what_is_not_valid_on_the_command_line_is_one_line():

@@ -13,7 +13,7 @@ from zakai.cli._files import check_outputs
 from zakai.cli._progress import progress
 from zakai.errors import InputError
 from zakai.models.files import load_model
-from zakai.records import Record, Truth, read_inputs, read_record, read_truth
+from zakai.records import Record, read_inputs, read_record, read_truth
 from zakai.records.writing import shown
 
 if TYPE_CHECKING:
@@ -47,7 +47,7 @@ def filter(
     from zakai.engine.kept_record import MOST_QUANTILES
 
     model, record, options = _given(source, record_path, settings, inputs_path, unit, origin, columns)
-    truth = None if truth_path is None else _truth(truth_path, model, record)
+    truth = None if truth_path is None else read_truth(truth_path, model, record)
 
     if smoothed:
         from zakai.engine.smoother import smooth
@@ -183,15 +183,6 @@ def _summarise(
     width = max(len(name) for name, _ in table)
     for name, text in table:
         print(f"{name:<{width}}  {text}")
-
-
-def _truth(path: Path, model: Model, record: Record) -> Truth:
-    truth = read_truth(path, model)
-    times = np.concatenate([[model.start], record.times])
-    nearest = truth.times[np.clip(np.searchsorted(truth.times, times - 1e-9 * np.abs(times)), 0, len(truth.times) - 1)]
-    if not np.isclose(nearest, times, rtol=1e-9, atol=1e-12).any():
-        raise InputError(f"{path}: none of its times is one of the record; give the states at the times of the record")
-    return truth
 
 
 def options_of(settings: list[str]) -> dict[str, Any]:

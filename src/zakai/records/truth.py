@@ -11,8 +11,10 @@ from typing import Any
 import numpy as np
 
 from zakai import _display
-from zakai.records.csv import read_table
-from zakai.records.writing import write_table
+from zakai.errors import InputError
+from zakai.records.csv import Dates, read_table
+from zakai.records.record import Record
+from zakai.records.writing import shown, write_table
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -38,22 +40,36 @@ class Truth:
         return _display.html_table(repr(self), ("time", *names), rows, total=len(self))
 
 
-def read_truth(path: str | os.PathLike[str], model: Any) -> Truth:
+def read_truth(path: str | os.PathLike[str], model: Any, record: Record | None = None) -> Truth:
     r"""Read the true states of `model` from a CSV file.
 
     The header is `time` and the names of the states in their order; the rules are those of `read_record`: an
     empty cell or `nan` is "not known", and times need not be those of the record.
 
-    Raises InputError: the file, or its first bad row by its line number, cannot be used.
+    Args:
+        path: the CSV file.
+        model: the system.
+        record: the record of these states; one of its times at least is among theirs, and if its times are dates, so are theirs.
 
+    Raises:
+        InputError: the file, or its first bad row by its line number, cannot be used.
+
+    Example:
         >>> import zakai, tempfile, pathlib
         >>> path = pathlib.Path(tempfile.mkdtemp()) / "truth.csv"
         >>> _ = path.write_text("time,x\n0,0.1\n0.1,0.2\n")
         >>> read_truth(path, zakai.load_model("gallery:benes")).values.shape
         (2, 1)
     """
-    table, _ = read_table(Path(path), model.n, "states", model.state)
-    return Truth(table[:, 0], table[:, 1:], model.state)
+    dates = None if record is None or record.clock is None else Dates(record.clock.unit, record.clock.origin)
+    table, _ = read_table(Path(path), model.n, "states", model.state, dates=dates)
+    truth = Truth(table[:, 0], table[:, 1:], model.state)
+    if record is not None:
+        times = np.concatenate([[model.start], record.times])
+        nearest = truth.times[np.clip(np.searchsorted(truth.times, times - 1e-9 * np.abs(times)), 0, len(truth) - 1)]
+        if not np.isclose(nearest, times, rtol=1e-9, atol=1e-12).any():
+            raise InputError(f"{shown(path)}: none of its times is one of the record; give the states at the times of the record")
+    return truth
 
 
 def write_truth(path: str | os.PathLike[str], truth: Truth, names: Sequence[str]) -> None:

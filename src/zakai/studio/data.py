@@ -13,7 +13,7 @@ from zakai.errors import InputError
 from zakai.models._errors import listing
 from zakai.models.clock import clock
 from zakai.models.model import Model
-from zakai.records import Inputs, Record, Truth
+from zakai.records import Inputs, Record, Truth, read_truth
 from zakai.records.csv import Dates, clock_of, read_table
 from zakai.records.dates import date_of
 from zakai.records.dialect import dialect_of
@@ -40,7 +40,7 @@ def given(model: Model, request: Mapping[str, Any], folder: Path) -> Given:
     Args:
         model: the system.
         request: `{"kind": "simulate", "until", "step", "seed", "inputs"}` or
-            `{"kind": "file", "file", "columns", "unit", "origin"}`.
+            `{"kind": "file", "file", "columns", "inputs", "unit", "origin", "truth": {"file", "name"}}`.
         folder: where the files are that were given to the studio.
 
     Raises:
@@ -85,14 +85,23 @@ def _of_file(model: Model, request: Mapping[str, Any], folder: Path) -> Given:
         inputs = Inputs.of_rows(table[:, 0], table[:, 1 + model.m :])
     record = Record(table[:, 0], table[:, 1 : 1 + model.m], model.observation_kind, inputs, **clock_of(dates))
     record.check(model)
-    return Given(record, None, name)
+    truth = request.get("truth")
+    return Given(record, _truth(model, record, truth, folder) if isinstance(truth, Mapping) else None, name)
+
+
+def _truth(model: Model, record: Record, request: Mapping[str, Any], folder: Path) -> Truth:
+    path = file_of(request, folder)
+    try:
+        return read_truth(path, model, record)
+    except InputError as error:
+        raise InputError(str(error).replace(str(path), str(request.get("name") or "the true states")[:80])) from None
 
 
 def file_of(request: Mapping[str, Any], folder: Path) -> Path:
     """Return the path of a file that was given to the studio; a request has nothing but its number."""
     number = request.get("file")
     if not isinstance(number, str) or not _IDENTIFIER.fullmatch(number) or not (folder / f"{number}.csv").is_file():
-        raise InputError("the record is no longer here; drop the file again")
+        raise InputError("the file is no longer here; drop it again")
     return folder / f"{number}.csv"
 
 

@@ -24,7 +24,7 @@ def export(session: Session, request: Mapping[str, Any], report: Report) -> Answ
     what = str(request.get("what"))
     makers: dict[str, Callable[..., bytes]] = {
         "model.toml": lambda: session.model(request).text.encode(),
-        "record.csv": lambda: _record(session.given(session.model(request), request)),
+        "record.csv": lambda: _record(session.model(request), session.given(session.model(request), request)),
         "result.nc": lambda: _saved(session.held(request), "result.nc"),
         "result.csv": lambda: _saved(session.held(request), "result.csv"),
         "report.html": lambda: _report(session.held(request)),
@@ -48,10 +48,18 @@ def _report(held: Held) -> bytes:
         return (Path(folder) / "report.html").read_bytes()
 
 
-def _record(found: Any) -> bytes:
-    """Return the record as CSV, with its inputs as further columns where they are given at its times."""
+def _record(model: Any, found: Any) -> bytes:
+    """Return the record as CSV, with its known inputs as further columns."""
     record = found.record
-    names, values = list(record.names or [f"y{j + 1}" for j in range(record.values.shape[1])]), record.values
+    names, values = list(record.names or model.observation_names), record.values
+    if record.inputs is not None:
+        # They change at rows alone: a row whose time is not among theirs is empty.
+        at = np.searchsorted(record.inputs.times, record.times, side="right") - 1
+        known = record.inputs.values[np.maximum(at, 0)]
+        changes = np.isin(record.times, record.inputs.times) & (np.diff(record.times, prepend=-np.inf) > 0)
+        changes[0] = True  # holds from the start
+        names += list(model.inputs)
+        values = np.column_stack([values, np.where(changes[:, None], known, np.nan)])
     with TemporaryDirectory() as folder:
         path = Path(folder) / "record.csv"
         write_table(path, record.times, values, names, record.dates)
@@ -119,7 +127,8 @@ def _embedded(model: Any, record: Any) -> list[str]:
     lines = ["nan = float('nan')", "rows = np.array([  # time, and what was observed", *rows, "])"]
     inputs = ""
     if record.inputs is not None:
-        lines.append(f"inputs = zakai.Inputs({record.inputs.times.tolist()!r}, {record.inputs.values.tolist()!r})")
+        times, values = (f"np.array({part.tolist()!r})" for part in (record.inputs.times, record.inputs.values))
+        lines.append(f"inputs = zakai.Inputs.of_rows({times}, {values})")
         inputs = ", inputs=inputs"
     return [*lines, f'record = zakai.Record(rows[:, 0], rows[:, 1:], "{record.kind}"{inputs})']
 
@@ -150,14 +159,18 @@ def shell(session: Session, request: Mapping[str, Any], report: Report) -> Answe
     extra += "".join(f" --option {key}={value}" for key, value in options.items())
     lines = []
     if wanted.get("kind") == "file":
-        record = "record.csv"
         extra += f" --unit {wanted['unit']}" if wanted.get("unit") else ""
     else:
-        record = "record.csv"
         until, step, seed = wanted.get("until"), wanted.get("step"), wanted.get("seed", 0)
-        if not model.inputs:
-            lines.append(f"zakai simulate model.toml --until {until} --step {step} --seed {seed} -o {record}")
-    lines.append(f"zakai filter model.toml {record} -o result.nc{extra}")
+        known = ""
+        if model.inputs:
+            values = wanted.get("inputs") or {}
+            row = ",".join(str(float(value)) for value in (model.start, *(values.get(name, 0) for name in model.inputs)))
+            lines.append(f"printf 'time,{','.join(model.inputs)}\\n{row}\\n' > inputs.csv")
+            known = " --inputs inputs.csv"
+            extra += known
+        lines.append(f"zakai simulate model.toml --until {until} --step {step} --seed {seed}{known} -o record.csv")
+    lines.append(f"zakai filter model.toml record.csv -o result.nc{extra}")
     return {"text": "\n".join(lines)}, {}
 
 

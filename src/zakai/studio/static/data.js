@@ -81,6 +81,16 @@ export class Data {
     }
   }
 
+  /** A file with the true states, which the pictures show; one that is wrong is not kept. */
+  async _truth(file) {
+    const before = this.studio.state.data;
+    try {
+      const found = await upload(file, LARGEST);
+      this.studio.state.data = { ...before, truth: { file: found.file, name: file.name, of: this.studio.model.state.join() } };
+      if (await this._describe()) { this._mapping(); this.studio.remember(); this.studio.run(); } else this.studio.state.data = before;
+    } catch (error) { this.wrong(error.message); }
+  }
+
   wrong(message) {
     this.fault.textContent = message;
     this.fault.hidden = false;
@@ -116,18 +126,21 @@ export class Data {
       this.studio.state.data = { ...this.studio.state.data, [key]: list };
       this.changed();
     } }, names.map((name) => h("option", { value: name, selected: name === chosen }, name))));
+    const truth = [h("label", { class: "drop small", for: "truth-file" }, data.truth ? h("strong", {}, data.truth.name) : "True states, where they are known", h("small", {}, `a CSV with time, ${model.state.join(", ")}`)),
+      h("input", { type: "file", accept: ".csv,.txt,.tsv,text/csv", class: "file", id: "truth-file", "data-testid": "truth-file", onchange: ({ target }) => target.files[0] && this._truth(target.files[0]) })];
     const unit = field("Unit of time", h("select", { onchange: ({ target }) => { this.studio.state.data = { ...this.studio.state.data, unit: target.value || undefined }; this.changed(); } },
       UNITS.map((name) => h("option", { value: name, selected: name === (data.unit ?? this.studio.state.data.unit ?? "") }, name || "numbers"))), found.dated ? "of the model; the file has dates" : "");
     this.columns.replaceChildren(h("div", { class: "fields" },
       columns.map((name, j) => choose(`observation ${model.observations[j]}`, name, "columns", j)),
-      inputs.map((name, j) => choose(`input ${model.inputs[j]}`, name, "inputs", j)), unit),
+      inputs.map((name, j) => choose(`input ${model.inputs[j]}`, name, "inputs", j)), unit), ...truth,
       h("div", { class: "scroll" }, h("table", { class: "preview" }, h("thead", {}, h("tr", {}, found.columns.map((name) => h("th", {}, name)))),
         h("tbody", {}, found.rows.slice(0, 3).map((row) => h("tr", {}, row.map((cell) => h("td", {}, cell || "–"))))))));
   }
 
   /** The model is another one: other observations and inputs. */
   modelled() {
-    const { data } = this.studio.state;
+    const { data } = this.studio.state, { model } = this.studio;
+    if (data.truth && model && data.truth.of !== model.state.join()) this.studio.state.data = { ...data, truth: undefined };
     if (data.kind === "file") this._mapping();
     else if (!this.body.contains(document.activeElement)) this.draw();
   }
