@@ -49,7 +49,7 @@ _PUBLIC = {
     "ConditionError": "zakai.errors",
 }
 
-__version__ = "0.2.0"
+__version__ = "0.3.0"
 __all__ = [*_PUBLIC, "__version__"]  # noqa: PLE0604
 
 
