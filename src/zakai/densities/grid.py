@@ -81,7 +81,7 @@ class GridDensity(WeightedPoints):
         level = logs[tuple(nearest.T)]
         kernels = [interpolation(column, size, closed) for column, size, closed in zip(index.T, shape, self._closed, strict=True)]
         # Rounding of the largest term matters only where the density is below 1e-11 of it; there the slope is taken out.
-        deep = top - level > 25.0
+        deep = inside & (level > floor) & (top - level > 25.0)
         total = kernels[0] @ np.exp(logs - top)
         if len(kernels) == 2:
             total = np.einsum("pj,pj->p", total, kernels[1])
