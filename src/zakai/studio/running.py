@@ -17,7 +17,7 @@ from zakai.report import words
 from zakai.studio import pictures
 from zakai.studio.session import Answer, Held, Report, Session, state_of
 
-COARSE = 1e-2  # tolerance while a slider is dragged
+COARSE, FEW = 1e-2, 400  # tolerance, and most columns of the picture, while a slider is dragged
 WHOLE = 3_000  # rows that are filtered from the start while a slider is dragged; of more, those that are seen
 BEFORE = 200  # rows before the first that is seen, in which the start of a part is forgotten
 MOST_PAIRS = 45
@@ -113,6 +113,7 @@ def slide(session: Session, request: Mapping[str, Any], report: Report) -> Answe
     held = session.held(request)
     model = session.model(request)
     view = pictures.View.of(request)
+    view = view._replace(columns=min(view.columns, FEW))
     method, options = coarse(held.result, *method_of(request))
     part, record, whole = part_of(held, model, view)
     result = run_filter(part, record, method, **options)
