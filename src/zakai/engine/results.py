@@ -138,7 +138,7 @@ class FilterResult:
             with np.errstate(all="ignore"):
                 share = self.mean_standard_error / np.sqrt(self.variance)
             share[self.variance <= 0] = 0.0
-            return np.asarray(share.max(axis=1))
+            return np.asarray(np.hypot(share.max(axis=1), self.health.get("error_estimate", 0.0)))
         for name in _ERRORS_OF_MEANS:
             if name in self.health:
                 return np.asarray(self.health[name])

@@ -217,7 +217,7 @@ class SmoothingRun(Run):
             here = slice(rows.start - begin, rows.stop - begin)
             message, infos = self._backward(prepared, here, states, message, rows, partial(step, self))
             health = dict(infos.health)
-            if not self.setting.method.random:
+            if self.backward.paths is None:  # draws know no evidence
                 own = np.append(forward[rows.start + 1 : rows.stop], expected)
                 health["evidence_error"] = np.abs(infos.log_likelihood_increment - own)
             here = slice(rows.start, rows.stop)
@@ -232,7 +232,7 @@ class SmoothingRun(Run):
             report(self, len(rows))
         self.parts.reverse()
         _, info = self.backward.smoothed(self.empty, self.first, message)
-        if not self.setting.method.random:
+        if self.backward.paths is None:
             error = abs(float(info.log_likelihood_increment) - expected)
             info = info._replace(health={**info.health, "evidence_error": error})
         self.start = info

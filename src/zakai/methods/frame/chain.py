@@ -17,11 +17,12 @@ convolution with a diagonal noise, moments and marginals, weighted points of its
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from zakai.methods.frame.build import CLOUD, Builder
+from zakai.methods.frame.moves import Flow, Kick, Move, Noise
 from zakai.methods.frame.placement import Mass
 from zakai.methods.frame.state import Prepared, Unresolved
 from zakai.methods.frame.weak_points import WeakPoints
@@ -55,12 +56,13 @@ class Prediction:
 
 @dataclass
 class Chain:
-    """The motion of a density over one interval."""
+    """The motion of a density over one interval, and the `moves` of the last prediction, in the order of time."""
 
     prepared: Prepared
     interval: Interval
     values: Array
     builder: Builder
+    moves: list[Move] = field(default_factory=list)
 
     def _carried(self, u: Train, t0: float, t1: float) -> tuple[Carried, Mass]:
         """Return a density after the flow from t0 to t1 as a function, and points of it."""
@@ -78,6 +80,7 @@ class Chain:
             top = float(logs.max())
             mass = mass.reweighted(logs)
         back = motion.path(self.interval, t1, t0, self.values, steps)
+        self.moves.append(Flow(motion, back))
         term = Term(u, np.array([1.0, top]), motion.backward, back)
         nothing = Likelihood(motion.coefficients.law, np.zeros(0), np.zeros(0), t1, 1.0, 0.0)
         turn = np.full(len(points), np.nan)
@@ -94,8 +97,11 @@ class Chain:
         scale = np.maximum(np.sqrt(np.diag(P)), 1e-12)
         Q = prepared.motion.noise(self.interval, self.values, t1, length, (mean, scale))
         v, D, total = self._built(function, mass, Q)
-        v = v.convolve(np.maximum(np.diag(D), 0.0), ROUNDING * self.builder.options.tolerance)
-        return corrected(v, D).scaled(1.0 / total), *self._of_mass(function, total)
+        variances, turned = np.maximum(np.diag(D), 0.0), corrections(D)
+        self.moves.append(Noise(v, variances, turned))
+        v = v.convolve(variances, ROUNDING * self.builder.options.tolerance)
+        v = v.in_basis(np.ascontiguousarray(v.grid.basis @ turned))
+        return v.scaled(1.0 / total), *self._of_mass(function, total)
 
     def _of_mass(self, function: Carried, total: float) -> tuple[float, float]:
         """Return the logarithm of the mass that a motion leaves, and the defect where it should be one."""
@@ -128,7 +134,8 @@ class Chain:
         log_mass, defect, v = 0.0, 0.0, function.terms[0].density
         kicks = motion.kicks(self.interval, t, length)
         for c in kicks or [np.zeros(self.prepared.system.base.r)]:
-            spread, mass = WeakPoints(self.builder, self.interval, self.values, (t, length)).spread(function, mass, c)
+            spread, mass, paths = WeakPoints(self.builder, self.interval, self.values, (t, length)).spread(function, mass, c)
+            self.moves.append(Kick(motion, spread, paths))
             v, _, total = self._built(spread, mass, None)
             gained, lost = self._of_mass(function, total)
             log_mass, defect = log_mass + gained, defect + lost
@@ -141,6 +148,7 @@ class Chain:
     def predict(self, u: Train, count: int) -> Prediction:
         """Return the prediction by so many substeps; Unresolved where the density is lost."""
         start, stop = self.interval.start, self.interval.stop
+        self.moves = []
         if stop <= start:
             return Prediction(*self._carried(u, start, stop), 0.0, 0.0)
         self.builder.for_substeps(count)
@@ -166,13 +174,12 @@ class Chain:
             count *= 2
 
 
-def corrected(v: Train, D: Array) -> Train:
-    """Return a density with its basis changed so that noise D (n, n), of which the diagonal was applied, has its covariance."""
-    if np.abs(D - np.diag(np.diag(D))).max() < ALONE:
-        return v
+def corrections(D: Array) -> Array:
+    """Return the map (n, n) by which a density has its covariance after noise D (n, n), of which the diagonal was applied."""
     one = np.eye(len(D))
-    T = np.linalg.cholesky(one + D) / np.sqrt(1.0 + np.diag(D))
-    return v.in_basis(np.ascontiguousarray(v.grid.basis @ T))
+    if np.abs(D - np.diag(np.diag(D))).max() < ALONE:
+        return one
+    return np.asarray(np.linalg.cholesky(one + D) / np.sqrt(1.0 + np.diag(D)))
 
 
 def extrapolated(finer: Prediction, coarser: Prediction) -> Carried:

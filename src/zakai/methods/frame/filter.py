@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from zakai.densities import TensorTrainDensity
 from zakai.densities._values import wrap
 from zakai.methods._protocol import Info
 from zakai.methods.frame.build import CONTROLS, Builder, difference
@@ -139,6 +140,13 @@ def direction_of(prepared: Prepared, u: Train) -> Array | None:
     return found
 
 
+def density(prepared: Prepared, state: State) -> TensorTrainDensity:
+    """Return the density."""
+    model = prepared.model
+    periodic = tuple(name in model.periodic for name in model.state)
+    return TensorTrainDensity(state.train(prepared.system.periods), model.state, periodic)
+
+
 def step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[State, Info]:
     """Return the state after interval k of the schedule and what is observed at its stop, and what the step reports."""
     u = state.train(prepared.system.periods)
@@ -156,16 +164,7 @@ def step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[State
 def _step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[State, Info]:
     interval, control = prepared.interval(k), state.control
     builder = Builder(prepared, remembered=control.kept)
-    chain = Chain(prepared, interval, values, builder)
-    length = interval.stop - interval.start
-    number = control.interval + 1
-    count = min(max(1, math.ceil(length * control.time.rate - 1e-9)), MOST_SUBSTEPS)
-    u = state.train(prepared.system.periods)
-    prediction, count = chain.first(u, count)
-    time = control.time
-    exact = prepared.system.base.affine and prepared.system.base.sampled and not prepared.system.base.driven
-    if length > 0 and not exact and (time.both or number - time.audited >= AUDIT):
-        prediction, count, time = _audited(chain, u, prediction, count, number)
+    prediction, count, time = predicted(Chain(prepared, interval, values, builder), state)
     updated = update(builder, prediction, prepared.motion.likelihood(interval, values))
     v, rule = updated.density, builder.rule
     mean, cov = v.moments(direction_of(prepared, v))
@@ -191,8 +190,22 @@ def _step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[Stat
         "time_error": time.error,
         "effective_share": updated.effective,
     }
+    number = control.interval + 1
     moved = Control(number, time, error, 0.8 * control.kept + 0.2 * kept if number > 1 else kept)
     return State.of(v, moved), Info(updated.log_evidence, mean, cov, health)
+
+
+def predicted(chain: Chain, state: State) -> tuple[Prediction, int, Substeps]:
+    """Return the prediction over an interval, the number of its substeps, and how the next intervals are divided."""
+    prepared, interval, time = chain.prepared, chain.interval, state.control.time
+    length, number = interval.stop - interval.start, state.control.interval + 1
+    count = min(max(1, math.ceil(length * time.rate - 1e-9)), MOST_SUBSTEPS)
+    u = state.train(prepared.system.periods)
+    prediction, count = chain.first(u, count)
+    exact = prepared.system.base.affine and prepared.system.base.sampled and not prepared.system.base.driven
+    if length > 0 and not exact and (time.both or number - time.audited >= AUDIT):
+        return _audited(chain, u, prediction, count, number)
+    return prediction, count, time
 
 
 def _kept(prediction: Prediction, prepared: Prepared, cov: Array) -> float:

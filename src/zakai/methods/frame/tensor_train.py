@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from zakai.algebra.theorems import tensor_train as theorem
-from zakai.densities import TensorTrainDensity
 from zakai.methods._options import real_number, whole_number
 from zakai.methods._protocol import Method
-from zakai.methods.frame.filter import init, step
+from zakai.methods.frame.backward import BACKWARD
+from zakai.methods.frame.filter import density, init, step
 from zakai.methods.frame.motion import system_of
 from zakai.methods.frame.state import Prepared, State
 from zakai.methods.frame.validity import valid
@@ -41,13 +41,6 @@ def prepare(
     return Prepared(system_of(model), np.asarray(theta, float), schedule, tolerance, whole_number("most_rank", most_rank, 2, 200))
 
 
-def density(prepared: Prepared, state: State) -> TensorTrainDensity:
-    """Return the density."""
-    model = prepared.model
-    periodic = tuple(name in model.periodic for name in model.state)
-    return TensorTrainDensity(state.train(prepared.system.periods), model.state, periodic)
-
-
 BOUNDS = {
     "tolerance_ratio": (
         1.0, "the estimated error of the density exceeds what the tolerance allows by this factor. Raise most_rank, give more "
@@ -56,6 +49,10 @@ BOUNDS = {
     "tail_depth": (
         1.0, "depth in the tails of the prediction to which an observation leads, divided by the accurate depth. Lower the "
         "tolerance, or compare with guided-particles",
+    ),
+    "unknown_draws": (
+        0.01, "share of the smoother's draws to which the filter's density does not lead: a Gaussian stands for it. Compare with "
+        "guided-particles",
     ),
 }  # fmt: skip
 
@@ -74,6 +71,7 @@ METHOD: Method[Prepared, State] = Method(
     bounds=BOUNDS,
     differentiable=False,
     by_values=True,
+    backward=BACKWARD,
     valid=valid,
     shorter="raise the option tolerance (command: --option tolerance=...)",
     handles=frozenset(features.ASSUMPTIONS) - {features.OBSERVED_PATH},

@@ -18,7 +18,7 @@ from zakai.methods.frame.placement import Mass
 from zakai.methods.frame.state import Unresolved
 from zakai.methods.particles.interval import Interval
 from zakai.methods.particles.programs import Array
-from zakai.numerics.trains.carried import Carried, Term
+from zakai.numerics.trains.carried import Carried, Path, Term
 
 # Spacing of the trapezoidal rule in deviations of the noise times the density along it, of which its error is exp(-2 pi^2 / h^2).
 SPACING = 1.3
@@ -35,8 +35,8 @@ class WeakPoints:
     values: Array
     middle: tuple[float, float]
 
-    def spread(self, function: Carried, mass: Mass, c: Array) -> tuple[Carried, Mass]:
-        """Return a density after one column c (r,) of the noise as a function, and points of it."""
+    def spread(self, function: Carried, mass: Mass, c: Array) -> tuple[Carried, Mass, tuple[Path, ...]]:
+        """Return a density after one column c (r,) of the noise as a function, points of it, and the path back of each term."""
         motion, (t, length) = self.builder.prepared.motion, self.middle
         mass = mass.unwrapped(self.builder.prepared.system.base.angles)
         mean, P = mass.moments()
@@ -54,15 +54,16 @@ class WeakPoints:
         weights = weights / weights.sum()
         steps = self._steps(mass, scale, reach * c)
         (term,), points, shares = function.terms, mass.points.copy(), mass.weights.copy()
-        order, terms = np.random.default_rng(1).permutation(points.shape[1]), []
+        order, terms, paths = np.random.default_rng(1).permutation(points.shape[1]), list[Term](), list[Path]()
         for q, (node, weight) in enumerate(zip(nodes, weights, strict=True)):
             back = motion.kick(self.interval, self.values, (t, -length), node * c, steps)
             one = np.array([weight * term.scale[0], term.scale[1]])
             terms.append(Term(term.density, one, term.program, back.then(term.path)))
+            paths.append(back)
             own = order[q :: len(nodes)]
             points[:, own] = self._ends(points[:, own], node * c, steps)
             shares[own] *= weight
-        return replace(function, terms=tuple(terms)), Mass(points, shares / shares.sum())
+        return replace(function, terms=tuple(terms)), Mass(points, shares / shares.sum()), tuple(paths)
 
     def _ends(self, x: Array, c: Array, steps: int) -> Array:
         motion = self.builder.prepared.motion

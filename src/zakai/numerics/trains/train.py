@@ -21,7 +21,7 @@ SMALL = 1e-12  # variance of noise along an axis, in variances of the density, t
 
 
 @lru_cache(maxsize=8)
-def _radius(n: int) -> float:
+def tail_radius(n: int) -> float:
     """Return the square of the radius beyond which a Gaussian of n states has the share `TAIL` of its mass."""
     from scipy.stats import chi2
 
@@ -87,7 +87,7 @@ class Train:
         except np.linalg.LinAlgError:
             return none
         top = mass * float(np.prod(np.diag(whitening))) / (2.0 * math.pi) ** (0.5 * n)
-        return mean - self.grid.centre, np.ascontiguousarray(whitening), np.array([_radius(n), top])
+        return mean - self.grid.centre, np.ascontiguousarray(whitening), np.array([tail_radius(n), top])
 
     @cached_property
     def _packed(self) -> tuple[Any, ...]:
