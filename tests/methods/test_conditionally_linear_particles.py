@@ -252,3 +252,22 @@ def test_many_observations_of_a_linear_state_act_one_after_the_other():
     spread = np.sqrt(exact.variance[1:, 0])
     assert np.all(np.abs(result.mean[1:, 1] - exact.mean[1:, 0]) < 0.02 * spread)
     assert np.allclose(result.variance[1:, 1], exact.variance[1:, 0], rtol=0.04)
+
+
+def test_an_input_that_jumps_after_many_rows_at_rest_makes_the_substeps_anew():
+    """The state v is at rest under the old input, so that one substep is exact, until w jumps."""
+    model = zakai.Model(
+        state=["u", "v"], drift=["-0.01*u", "w/30 - v/30"], diffusion=[["0.01", "0"], ["0", "0.0001"]], inputs=["w"],
+        observation=["tanh(u) - v"], observation_kind="samples", observation_noise=[[1e-4]],
+        prior={"kind": "gaussian", "mean": [0.0, 1.0], "cov": [0.01, 1e-6]},
+    )  # fmt: skip
+    times, jumps = np.arange(60.0, 3000.0, 60.0), np.arange(0.0, 3000.0, 430.0)
+    inputs = zakai.Inputs(jumps, np.arange(len(jumps)) % 2 == 0)
+    record = zakai.Record(times, np.full((len(times), 1), np.nan), "samples", inputs=inputs)
+    result = zakai.filter(model, record, "guided-particles")
+    known, v, t = [], 1.0, 0.0
+    for stop in np.unique([*times, *jumps[1:]]):
+        v = inputs.at(t)[0] + (v - inputs.at(t)[0]) * np.exp((t - stop) / 30.0)
+        t = stop
+        known += [v] if stop in times else []
+    assert np.abs(result.mean[1:, 1] - known).max() < 0.2 * np.sqrt(result.variance[-1, 1])

@@ -282,13 +282,13 @@ def _steps(
     prepared: Prepared, interval: Interval, values: Array, state: State, about: tuple[Array, Array]
 ) -> tuple[Steps, Control]:
     """Return the substeps of an interval, measured where the last measurement does not hold any more, and the controls."""
-    control, (mean, scale) = state.control, about
+    control, (mean, scale), hold = state.control, about, prepared.model.input_hold
     length = interval.stop - interval.start
     guess = min(max(1, round(control.substeps * length)), MOST_SUBSTEPS)
     if length <= 0:
         return Steps(Scheme(1, 4), np.zeros(len(mean)), 0.0, 0.0), control
     # The error of an interval is of the third order of its length, and was measured in deviations of that time.
-    ratio = (length / control.length) ** 3 if control.trusted else np.inf
+    ratio = (length / control.length) ** 3 if control.trusted and not interval.inputs_change(hold) else np.inf
     ratio *= max(1.0, float((state.last_scale / scale).max()))
     if ratio <= LONGER and control.error * ratio <= SURE * TIME_ERROR:
         known = Steps(Scheme(guess, control.stages), state.last_shift, control.error, control.error)

@@ -38,6 +38,15 @@ class Interval(NamedTuple):
     elapsed: Array
     inputs: Inputs | None
 
+    def inputs_change(self, hold: str) -> bool:
+        """Return whether an input, or with `hold` "linear" its slope, jumps at the start of the interval or inside of it."""
+        if self.inputs is None:
+            return False
+        times = np.append(self.start, self.inputs.within(self.start, self.stop))
+        if hold == "linear":
+            return len(times) > 1 or bool(np.isin(self.start, self.inputs.times))
+        return bool((self.inputs.at(times) != self.inputs.at(self.start, before=True)).any())
+
 
 class Events(NamedTuple):
     """What the kernels run; see `numerics/particles/motion.py`."""
