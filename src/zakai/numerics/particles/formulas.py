@@ -16,6 +16,18 @@ from numba import types
 
 from zakai.numerics.compiled import helper, kernel
 from zakai.numerics.formula_kernel import BINARY, BLOCK, CLOCK, NEITHER, UNARY, _binary, _unary
+from zakai.numerics.particles.elementary import (
+    abs_row,
+    atan2_row,
+    atan_row,
+    exp_row,
+    floor_row,
+    log_row,
+    sin_row,
+    sqrt_row,
+    square_row,
+    tanh_row,
+)
 
 Array = Any
 F1, F2, F3 = types.float64[::1], types.float64[:, ::1], types.float64[:, :, ::1]
@@ -24,7 +36,10 @@ PROGRAM = types.Tuple((I2, F1, I1, I1, I2, F1))
 BOX = types.Tuple((F1, F1))
 SIMPLE = len(BINARY) + len(UNARY)  # operations from here on are the ones below
 SINC, TABLE, LOGGAMMA, LOGBESSEL = SIMPLE, SIMPLE + 1, SIMPLE + 2, SIMPLE + 3
-_BINARIES, _POWER = len(BINARY), BINARY.index("power")
+_BINARIES, _POWER, _ATAN2 = len(BINARY), BINARY.index("power"), BINARY.index("atan2")
+_SIN, _COS, _EXP, _LOG, _SQRT, _TANH, _ATAN, _ABS, _FLOOR = (
+    len(BINARY) + UNARY.index(name) for name in ("sin", "cos", "exp", "log", "sqrt", "tanh", "atan", "abs", "floor")
+)
 GIVEN = NEITHER - 1
 _NEAR = 8.0  # |x| up to which the derivatives of sinc are integrals
 _NODES, _WEIGHTS = (np.ascontiguousarray(part) for part in np.polynomial.legendre.leggauss(24))
@@ -124,15 +139,42 @@ def _table(row: Array, numbers: Array, x: float, y: float) -> float:
 
 
 @helper
+def _row(operation: int, a: Array, b: Array, number: int, out: Array) -> None:
+    """Write the result of an operation on rows; `number` is the exponent of a whole power."""
+    if operation == _POWER and number <= 4:
+        square_row(a, number, out)
+    elif operation == _ATAN2:
+        atan2_row(a, b, out)
+    elif operation < _BINARIES:
+        _binary(operation, a, b, out, number)
+    elif operation == _SIN or operation == _COS:
+        sin_row(a, int(operation == _COS), out)
+    elif operation == _EXP:
+        exp_row(a, out)
+    elif operation == _LOG:
+        log_row(a, out)
+    elif operation == _SQRT:
+        sqrt_row(a, out)
+    elif operation == _TANH:
+        tanh_row(a, out)
+    elif operation == _ATAN:
+        atan_row(a, out)
+    elif operation == _ABS:
+        abs_row(a, out)
+    elif operation == _FLOOR:
+        floor_row(a, out)
+    else:
+        _unary(operation - _BINARIES, a, out)
+
+
+@helper
 def run_program(program: Any, values: Array, size: int) -> None:
     """Compute the slots (S, BLOCK) that the lines write, at the first points of a block."""
     code, tables, numbers = program[0], program[4], program[5]
     for line in range(code.shape[0]):
         operation, result, a, b, number = code[line, 0], code[line, 1], code[line, 2], code[line, 3], code[line, 4]
-        if operation < _BINARIES:
-            _binary(operation, values[a, :size], values[a if operation == _POWER else b, :size], values[result, :size], number)
-        elif operation < SIMPLE:
-            _unary(operation - _BINARIES, values[a, :size], values[result, :size])
+        if operation < SIMPLE:
+            _row(operation, values[a, :size], values[a if operation == _POWER else b, :size], number, values[result, :size])
         elif operation == SINC:
             for i in range(size):
                 values[result, i] = _sinc(values[a, i], number)

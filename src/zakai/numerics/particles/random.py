@@ -10,7 +10,6 @@ References:
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import numpy as np
@@ -18,6 +17,7 @@ from numba import types
 
 from zakai.numerics.compiled import helper, kernel
 from zakai.numerics.formula_kernel import BLOCK
+from zakai.numerics.particles.elementary import log_row
 
 Array = Any
 KEY = types.uint64[::1]
@@ -66,42 +66,50 @@ def _central(p: float) -> float:
 
 
 @helper
-def _tail(p: float) -> float:
-    """Return the quantile for a probability below 0.075 or above 0.925."""
-    q = p - 0.5
-    r = math.sqrt(-math.log(p if q < 0 else 1.0 - p))
-    if r <= 5.0:
-        r -= 1.6
-        above = ((((((7.74545014278341407640e-4 * r + 2.27238449892691845833e-2) * r + 2.41780725177450611770e-1) * r
-                   + 1.27045825245236838258e0) * r + 3.64784832476320460504e0) * r + 5.76949722146069140550e0) * r
-                 + 4.63033784615654529590e0) * r + 1.42343711074968357734e0  # fmt: skip
-        below = ((((((1.05075007164441684324e-9 * r + 5.47593808499534494600e-4) * r + 1.51986665636164571966e-2) * r
-                   + 1.48103976427480074590e-1) * r + 6.89767334985100004550e-1) * r + 1.67638483018380384940e0) * r
-                 + 2.05319162663775882187e0) * r + 1.0  # fmt: skip
-    else:
-        r -= 5.0
-        above = ((((((2.01033439929228813265e-7 * r + 2.71155556874348757815e-5) * r + 1.24266094738807843860e-3) * r
-                   + 2.65321895265761230930e-2) * r + 2.96560571828504891230e-1) * r + 1.78482653991729133580e0) * r
-                 + 5.46378491116411436990e0) * r + 6.65790464350110377720e0  # fmt: skip
-        below = ((((((2.04426310338993978564e-15 * r + 1.42151175831644588870e-7) * r + 1.84631831751005468180e-5) * r
-                   + 7.86869131145613259100e-4) * r + 1.48753612908506148525e-2) * r + 1.36929880922735805310e-1) * r
-                 + 5.99832206555887937690e-1) * r + 1.0  # fmt: skip
-    return -above / below if q < 0 else above / below
+def _outer(r: float) -> float:
+    """Return the quantile for the probability 1 - exp(-r^2), from 0.925 to where float64 ends."""
+    near = r <= 5.0
+    s = r - 1.6
+    above = ((((((7.74545014278341407640e-4 * s + 2.27238449892691845833e-2) * s + 2.41780725177450611770e-1) * s
+               + 1.27045825245236838258e0) * s + 3.64784832476320460504e0) * s + 5.76949722146069140550e0) * s
+             + 4.63033784615654529590e0) * s + 1.42343711074968357734e0  # fmt: skip
+    below = ((((((1.05075007164441684324e-9 * s + 5.47593808499534494600e-4) * s + 1.51986665636164571966e-2) * s
+               + 1.48103976427480074590e-1) * s + 6.89767334985100004550e-1) * s + 1.67638483018380384940e0) * s
+             + 2.05319162663775882187e0) * s + 1.0  # fmt: skip
+    t = r - 5.0
+    above_far = ((((((2.01033439929228813265e-7 * t + 2.71155556874348757815e-5) * t + 1.24266094738807843860e-3) * t
+                   + 2.65321895265761230930e-2) * t + 2.96560571828504891230e-1) * t + 1.78482653991729133580e0) * t
+                 + 5.46378491116411436990e0) * t + 6.65790464350110377720e0  # fmt: skip
+    below_far = ((((((2.04426310338993978564e-15 * t + 1.42151175831644588870e-7) * t + 1.84631831751005468180e-5) * t
+                   + 7.86869131145613259100e-4) * t + 1.48753612908506148525e-2) * t + 1.36929880922735805310e-1) * t
+                 + 5.99832206555887937690e-1) * t + 1.0  # fmt: skip
+    return (above if near else above_far) / (below if near else below_far)
 
 
 @helper
 def fill_row(key: Array, row: int, first: int, size: int, out: Array) -> None:
     """Write one row (size,) of standard normal numbers for the particles from `first` on; row and particle are the counter."""
     counter = (np.uint64(row) << np.uint64(32)) + np.uint64(first)
-    p = np.empty(size)
+    p, found, far, places = np.empty(size), np.empty(size), np.empty(size), np.empty(size, np.int64)
     for i in range(size):
         p[i] = uniform(key, counter + np.uint64(i))
-    # Loops without branches are vectorised: most numbers are central.
+    # Loops without branches are vectorised: most numbers are central, and the others are put together.
     for i in range(size):
-        out[i] = _central(p[i])
+        found[i] = _central(p[i])
+    count = 0
     for i in range(size):
-        if abs(p[i] - 0.5) > 0.425:
-            out[i] = _tail(p[i])
+        places[count] = i
+        count += abs(p[i] - 0.5) > 0.425
+    for j in range(count):
+        far[j] = 0.5 - abs(p[places[j]] - 0.5)
+    log_row(far[:count], far[:count])
+    for j in range(count):
+        far[j] = _outer(np.sqrt(-far[j]))
+    for j in range(count):
+        q = p[places[j]]
+        found[places[j]] = -far[j] if q < 0.5 else far[j]
+    for i in range(size):
+        out[i] = found[i]
 
 
 @helper
