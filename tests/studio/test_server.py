@@ -241,7 +241,7 @@ def test_the_script_of_a_record_from_a_file_computes_the_same(page: Page, tmp_pa
     assert zakai.load_result(tmp_path / "stored.nc").log_likelihood == answer["log_likelihood"]
 
 
-ROOM = zakai.gallery.text("heated-room")
+HEATED = zakai.gallery.text("heated-room")
 
 
 @pytest.mark.parametrize("simulated", [True, False])
@@ -252,17 +252,17 @@ def test_a_record_with_known_inputs_is_taken_away_whole(page: Page, tmp_path, si
         rows = "time,outdoor,indoor,heater\n0.5,-2,19.5,1\n1,,19,\n1.5,-1,,0.5\n2.25,-1.5,18.5,2\n"
         number = page.upload(rows.encode()).json()["file"]
         data = {"kind": "file", "file": number, "name": "room.csv", "columns": ["indoor"], "inputs": ["heater", "outdoor"]}
-    answer = page.ask("run", text=ROOM, data=data, name="main")
+    answer = page.ask("run", text=HEATED, data=data, name="main")
     assert "error" not in answer, answer
-    (tmp_path / "model.toml").write_text(ROOM)
-    (tmp_path / "record.csv").write_bytes(page.ask("export", what="record.csv", text=ROOM, data=data)["bytes"].tobytes())
+    (tmp_path / "model.toml").write_text(HEATED)
+    (tmp_path / "record.csv").write_bytes(page.ask("export", what="record.csv", text=HEATED, data=data)["bytes"].tobytes())
     model = zakai.load_model(tmp_path / "model.toml")
     again = zakai.filter(model, zakai.read_record(tmp_path / "record.csv", model))
     assert again.log_likelihood == answer["log_likelihood"]
-    (tmp_path / "filter.py").write_bytes(page.ask("export", what="filter.py", text=ROOM, data=data)["bytes"].tobytes())
+    (tmp_path / "filter.py").write_bytes(page.ask("export", what="filter.py", text=HEATED, data=data)["bytes"].tobytes())
     done = subprocess.run([sys.executable, "filter.py"], cwd=tmp_path, capture_output=True, text=True, check=True)
     assert f"log-likelihood {answer['log_likelihood']!r}" in done.stdout
-    lines = page.ask("shell", text=ROOM, data=data)["text"]
+    lines = page.ask("shell", text=HEATED, data=data)["text"]
     done = subprocess.run(lines, cwd=tmp_path, shell=True, capture_output=True, text=True, check=True, env=shell_environment())
     assert zakai.load_result(tmp_path / "result.nc").log_likelihood == answer["log_likelihood"]
 

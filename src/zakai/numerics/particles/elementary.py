@@ -1,7 +1,7 @@
 """Elementary functions of rows of numbers, in loops without branches that the compiler vectorises.
 
-The functions of the C library take one number at a time, and several times as long.  Errors are below two units in the last place.
-Arguments for which the short way does not hold (NaN, infinity, zero, large angles) are computed one by one afterwards.
+The functions of the C library take one number at a time, and several times as long.  Errors are below two units in the last
+place.  Arguments for which the short way does not hold (NaN, infinity, zero, large angles) are computed one by one afterwards.
 
 References:
     Cody and Waite 1980, Software manual for the elementary functions (reductions of the argument).
@@ -30,13 +30,16 @@ _SIGN = np.int64(-0x8000000000000000)
 _MANTISSA, _ONE = np.int64(0x000FFFFFFFFFFFFF), np.int64(0x3FF0000000000000)
 
 
-@intrinsic
+_native: Any = intrinsic  # its types count an argument too many
+
+
+@_native
 def _bits(context: Any, x: Any) -> Any:
     """Return the bits of a float64 as an int64."""
     return types.int64(types.float64), lambda _, builder, __, args: builder.bitcast(args[0], ir.IntType(64))
 
 
-@intrinsic
+@_native
 def _number(context: Any, x: Any) -> Any:
     """Return the float64 with the bits of an int64."""
     return types.float64(types.int64), lambda _, builder, __, args: builder.bitcast(args[0], ir.DoubleType())
