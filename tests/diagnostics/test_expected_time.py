@@ -68,7 +68,7 @@ def test_a_slow_first_observation_gives_a_lower_bound(monkeypatch, interrupted):
         assert isinstance(found[0], AssertionError)
 
 
-def test_a_kernel_is_compiled_to_its_end():
+def test_a_kernel_that_is_compiled_is_completed():
     loop = "    for k in range(9):\n        y += np.sin(y) / (k + y * y)\n"
     source = "def inner(x):\n    y = x\n" + 60 * loop + "    return y\n"
     names: dict[str, Any] = {"np": np}

@@ -251,7 +251,7 @@ def test_a_record_with_known_inputs_is_taken_away_whole(page: Page, tmp_path, si
     else:
         rows = "time,outdoor,indoor,heater\n0.5,-2,19.5,1\n1,,19,\n1.5,-1,,0.5\n2.25,-1.5,18.5,2\n"
         number = page.upload(rows.encode()).json()["file"]
-        data = {"kind": "file", "file": number, "name": "room.csv", "columns": ["indoor"], "inputs": ["heater", "outdoor"]}
+        data = {"kind": "file", "file": number, "name": "house.csv", "columns": ["indoor"], "inputs": ["heater", "outdoor"]}
     answer = page.ask("run", text=HEATED, data=data, name="main")
     assert "error" not in answer, answer
     (tmp_path / "model.toml").write_text(HEATED)
