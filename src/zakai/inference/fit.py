@@ -22,6 +22,8 @@ from zakai.models._errors import listing
 from zakai.models.model import Model
 from zakai.records import Inputs, Record
 
+SMALL = 0.1  # of a standard error, by which the jumps of a log-likelihood may move its maximum without a warning
+
 
 @dataclass(frozen=True, eq=False)
 class Fit:
@@ -247,10 +249,12 @@ def _fit_by_values(
                     known[key] = -np.inf
             return known[key]
 
-        found = random_maximum(value, values, box)
+        found = random_maximum(value, values, box, first is not None)
     result = result_at(found.values, 0)
     errors = np.sqrt(np.diag(found.covariance))
-    warnings = [*([] if first is None else [sentence(names, found)]), *result.warnings]
+    # Jumps of a log-likelihood matter where they move the maximum by a part of a standard error.
+    matters = first is not None or not (found.errors <= SMALL * errors).all()
+    warnings = [*([sentence(names, found, first is not None)] if matters else []), *result.warnings]
     if not found.converged:
         warnings.insert(0, "the fit did not converge; these are the best values that were found")
     estimates = dict(zip(names, found.values.tolist(), strict=True))
@@ -261,7 +265,7 @@ def _fit_by_values(
         model=model.with_parameters(**estimates),
         converged=found.converged,
         message=f"{'converged' if found.converged else 'not converged'}: quadratics through values"
-        + (" with common random numbers" if first is not None else ""),
+        + (" with common random numbers" if first is not None else "" if matters else f"; {sentence(names, found, False)}"),
         iterations=found.iterations,
         covariance=found.covariance,
         method=result.method,

@@ -2,9 +2,9 @@
 
     l(theta) ~ l0 + g.(theta - c) + (theta - c)'H (theta - c) / 2,  by least squares over points around c,  c <- c - H^-1 g
 
-The distance of the points is that over which l falls by about one half, which is a standard error of the parameters: nearer
-points would see the jumps of the function, and not its curvature.  The spread of the maxima for several seeds says how far the
-maximum is known.
+The distance of the points is about a standard error of the parameters, over which l falls by one half: nearer points would see
+the jumps of the function, and not its curvature.  The spread of the maxima for several seeds says how far the
+maximum is known; of a function that has small jumps but no seed, that for points around several centres.
 
 References:
     Myers, Montgomery and Anderson-Cook 2009, Response surface methodology.
@@ -22,6 +22,8 @@ ROUNDS, SEEDS = 12, 4
 FIRST = 0.1  # distance of the first points, relative to a parameter
 CLOSE = 0.2  # of a step, in distances of the points, that ends the search
 DISTANCE = 1.5  # of the points, in standard errors
+NEAR = 0.5  # the same for jumps of some thousandths: further away a likelihood is no quadratic
+SHIFT = 0.1  # between centres, in distances of the points: the jumps of tensor trains are independent from 1e-3 on
 _FACTOR = 3.0  # by which the distances change in a round, at most
 
 
@@ -35,11 +37,18 @@ class RandomMaximum(NamedTuple):
     iterations: int
 
 
-def random_maximum(function: Callable[[Array, int], float], start: Array, box: Array) -> RandomMaximum:
-    """Return the maximum of a function of p parameters and a seed, within bounds (p, 2)."""
+def random_maximum(function: Callable[[Array, int], float], start: Array, box: Array, seeds: bool = True) -> RandomMaximum:
+    """Return the maximum of a function of p parameters and a seed, within bounds (p, 2).
+
+    Args:
+        function: the function.
+        start: the parameters from which the search begins (p,).
+        box: the bounds.
+        seeds: whether the values depend on the seed; else centres are shifted instead.
+    """
     centre = np.array(start, float)
     apart = np.maximum(FIRST * np.abs(centre), 0.5 * FIRST)
-    converged, rounds = False, 0
+    converged, rounds, distance = False, 0, DISTANCE if seeds else NEAR
     while rounds < ROUNDS and not converged:
         rounds += 1
         slope, H = _quadratic(lambda theta: 0.5 * (function(theta, 0) + function(theta, 1)), centre, apart, box)
@@ -47,15 +56,16 @@ def random_maximum(function: Callable[[Array, int], float], start: Array, box: A
         moved = np.clip(centre + step, box[:, 0], box[:, 1]) - centre
         centre = centre + moved
         curvature = -np.diag(H)
-        wanted = np.where(curvature > 0, DISTANCE / np.sqrt(np.maximum(curvature, 1e-300)), _FACTOR * apart)
+        wanted = np.where(curvature > 0, distance / np.sqrt(np.maximum(curvature, 1e-300)), _FACTOR * apart)
         changed = np.clip(wanted, apart / _FACTOR, apart * _FACTOR)
         settled = bool(np.all(np.abs(np.log(changed / apart)) < np.log(1.5)))
         apart = changed
         converged = settled and bool(np.all(np.abs(moved) <= CLOSE * apart) and np.all(curvature > 0))
     maxima, hessians = [], []
     for seed in range(SEEDS):
-        slope, H = _quadratic(lambda theta, seed=seed: function(theta, seed), centre, apart, box)  # type: ignore[misc]
-        maxima.append(centre + _step(slope, H, apart))
+        own = centre if seeds else np.clip(centre + SHIFT * (seed - 0.5 * (SEEDS - 1)) * apart, box[:, 0], box[:, 1])
+        slope, H = _quadratic(lambda theta, seed=seed: function(theta, seed), own, apart, box)  # type: ignore[misc]
+        maxima.append(own + _step(slope, H, apart))
         hessians.append(H)
     H = np.mean(hessians, axis=0)
     errors = np.std(maxima, axis=0, ddof=1) / np.sqrt(SEEDS)
@@ -95,7 +105,8 @@ def _step(slope: Array, H: Array, apart: Array) -> Array:
     return np.clip(step, -2.0, 2.0) * apart
 
 
-def sentence(names: Sequence[str], found: RandomMaximum) -> str:
+def sentence(names: Sequence[str], found: RandomMaximum, seeds: bool = True) -> str:
     """Return how far the maximum is known."""
     known = ", ".join(f"{name} +- {error:.2g}" for name, error in zip(names, found.errors, strict=True))
-    return f"the log-likelihood has random errors: by {SEEDS} seeds its maximum is known to {known}, beside the standard errors"
+    what, by = ("random errors", "seeds") if seeds else ("small jumps", "sets of values")
+    return f"the log-likelihood has {what}: by {SEEDS} {by} its maximum is known to {known}, beside the standard errors"
