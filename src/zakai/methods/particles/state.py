@@ -21,8 +21,8 @@ class Control(NamedTuple):
 
     `interval` counts intervals; `substeps` per unit time with `stages`, whose `error` was measured in an interval of this
     `length` and is trusted in so many more; `narrow` the ratio of the deviations after and before the last observation,
-    `variance` of a mean times N, `last` intervals of the window at the last move, `urgency` what has added up since then, `floor`
-    what it has left, `doubtful_until` the number of resamplings until which standard errors are lower bounds, and `shifted` the
+    `variance` of a mean times N, `losses` the sum of these and `work` that of steps and moves, `since` counts steps after the
+    last move and `floor` is what that has left, `doubtful_until` the number of resamplings until which standard errors are lower bounds, and `shifted` the
     variance of the log-likelihood by the time step.
     """
 
@@ -34,8 +34,9 @@ class Control(NamedTuple):
     trusted: int
     narrow: float
     variance: float
-    last: int
-    urgency: float
+    losses: float
+    work: float
+    since: int
     floor: float
     doubtful_until: int
     shifted: float

@@ -23,6 +23,7 @@ from numba import types
 from zakai.numerics.compiled import helper, kernel
 from zakai.numerics.formula_kernel import BLOCK
 from zakai.numerics.particles.chunks import CHUNK
+from zakai.numerics.particles.elementary import add_rows
 from zakai.numerics.particles.formulas import F1, F2, PROGRAM, block_of, load_point, run_program
 from zakai.numerics.particles.motion import EVENTS, MOTION, buffers_of, run_event
 from zakai.numerics.particles.random import KEY, fill_normals, fill_row, uniform
@@ -135,20 +136,20 @@ def _mean(gaussian: Any, start: Array, out: Array, size: int) -> None:
 
 @helper
 def _scale(gaussian: Any, inverse: bool, given: Array, along: Array, size: int) -> None:
-    """Multiply columns (D, size) by U, or by its inverse; `along` (size,) is overwritten."""
+    """Multiply columns (D, size) by U, or by its inverse; `along` (r, size) is overwritten."""
     V, factors = gaussian[3], gaussian[4]
+    changes = np.empty(factors.size)
     for k in range(factors.size):
         factor = (1.0 / factors[k] if inverse else factors[k]) - 1.0
         for i in range(size):
-            along[i] = 0.0
-        for r in range(V.shape[1]):
-            entry = V[k, r]
-            for i in range(size):
-                along[i] += entry * given[r, i]
-        for r in range(V.shape[1]):
-            entry = factor * V[k, r]
-            for i in range(size):
-                given[r, i] += entry * along[i]
+            along[k, i] = 0.0
+        add_rows(along[k], V[k], given, size)
+        for i in range(size):
+            along[k, i] *= factor
+    for r in range(V.shape[1]):
+        for k in range(factors.size):
+            changes[k] = V[k, r]
+        add_rows(given[r], changes, along, size)
 
 
 @kernel(types.void(WINDOW_LAW, F2, F2, types.int64, types.int64, F2, F1))
@@ -170,7 +171,7 @@ def follow(window: Any, start: Array, path: Array, low: int, high: int, out: Arr
 @kernel(types.void(GAUSSIAN, types.float64, KEY, F2, types.int64, types.int64, F2, F1))
 def draw(gaussian: Any, share: float, key: Array, start: Array, low: int, high: int, path: Array, ratio: Array) -> None:
     """Write noise (D, N) drawn from share N(0, I) + (1 - share) N(m, U^-2), and log N(0, I) less the log of that density."""
-    D, along = path.shape[0], np.empty(BLOCK)
+    D, along = path.shape[0], np.empty((gaussian[4].size, BLOCK))
     w, p, m = np.empty((D, BLOCK)), np.empty((D, BLOCK)), np.empty((D, BLOCK))
     log_det = 0.0
     for factor in gaussian[4]:
@@ -225,7 +226,7 @@ def sweep(window: Any, gaussian: Any, control: Array, key: Array, low: int, high
     for factor in gaussian[4]:
         log_det += math.log(factor)
     workspace = _workspace(window)
-    along = np.empty(BLOCK)
+    along = np.empty((gaussian[4].size, BLOCK))
     x, found = np.empty((window.motion[0][3].size, BLOCK)), np.empty(BLOCK)
     begin, new, fresh, m = np.empty((n, BLOCK)), np.empty((D + 1, BLOCK)), np.empty((D, BLOCK)), np.empty((D, BLOCK))
     w, target = np.empty((D, CHUNK)), np.empty(CHUNK)
