@@ -63,10 +63,10 @@ MOVE_COST, MOVE_GAIN, FORGOTTEN = 1.0, 1.5, 0.98
 MOVE_CONTROL = (1.0, 1.2, 4.0, 0.4, 1.0)  # power, change, most sweeps, rho, share
 VARIANCE = 5.0  # that of a mean times N, in variances of the state, that the number of particles is chosen for
 MOST_GROWTH = 4
-# Share of the allowed time error below which its measurement is trusted in so many more intervals, if it is certain or not, and
-# the ratio of the errors of two lengths up to which that holds.
 REPEATED, NARROWEST = 2.0, 0.02  # excess of the time error at which an interval is repeated, and least narrowing that counts
-SURE, TRUSTED, TRUSTED_LESS, LONGER = 0.5, 8, 2, 4.0
+# Of the time error: the share of the allowed one below which it holds in so many more intervals, the excess of substeps over
+# those that were expected up to which it holds twice as long as before, and the ratio of errors by length up to which it holds.
+SURE, TRUSTED, FORESEEN, LONGER = 0.5, 8, 1.3, 4.0
 
 
 def init(prepared: Prepared, prior: Any) -> State:
@@ -92,7 +92,7 @@ def _at_start(prepared: Prepared, particles: Array, first: Array, gaussian: tupl
     width = system.law.width if system.law is not None else system.factor.width  # type: ignore[union-attr]
     window = Window.begin(particles, first, gaussian, (width, len(prepared.motion.law[3])))
     logs, nothing = np.full(count, -np.log(count)), np.zeros(system.n)
-    control = Control(0, 0.0, 4, 0.0, 0.0, 0, 1.0, VARIANCE, 0.0, 0.0, 0, 1.0, 0, 0.0)
+    control = Control(0, 1, 4, 0.0, 0.0, 0, 0, 1.0, VARIANCE, 0.0, 0.0, 0, 1.0, 0, 0.0)
     return State(particles, logs, window, Genealogy.begin(count), control, nothing, nothing, np.ones(system.n))
 
 
@@ -215,7 +215,7 @@ def _step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[Stat
         if last_turn or steps.error * narrow <= REPEATED * TIME_ERROR * found_narrow:
             break
         narrow = found_narrow
-    measured = state.last_scale if steps.shift is state.last_shift else narrow * scale
+    last = (steps.shift, narrow * scale) if steps.measured else (state.last_shift, state.last_scale)
     if done.lost > 0.5 * RARE:
         check_escape(prepared, k, at_start)
     cloud = done.cloud
@@ -274,7 +274,7 @@ def _step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[Stat
         interval=number, narrow=found_narrow, variance=variance, losses=losses, work=work, since=since, floor=floor,
         doubtful_until=until, shifted=shifted,
     )  # fmt: skip
-    return State(cloud.particles, cloud.logs, cloud.window, cloud.genealogy, control, shift, steps.shift, measured), info
+    return State(cloud.particles, cloud.logs, cloud.window, cloud.genealogy, control, shift, *last), info
 
 
 def _steps(
@@ -283,26 +283,31 @@ def _steps(
     """Return the substeps of an interval, measured where the last measurement does not hold any more, and the controls."""
     control, (mean, scale) = state.control, about
     length = interval.stop - interval.start
-    guess = min(max(1, round(control.substeps * length)), MOST_SUBSTEPS)
     if length <= 0:
         return Steps(Scheme(1, 4), np.zeros(len(mean)), 0.0, 0.0), control
     # The error of an interval is of the third order of its length, and was measured in deviations of that time.
-    ratio = (length / control.length) ** 3 if control.trusted else np.inf
+    ratio = (length / control.length) ** 3 if control.length else np.inf
     ratio *= max(1.0, float((state.last_scale / scale).max()))
-    if ratio <= LONGER and control.error * ratio <= SURE * TIME_ERROR:
-        known = Steps(Scheme(guess, control.stages), state.last_shift, control.error, control.error)
+    needed = control.substeps * np.sqrt(control.error * ratio / TIME_ERROR)
+    guess = max(1, int(np.ceil(needed))) if needed <= MOST_SUBSTEPS else max(1, control.substeps)
+    if control.trusted and ratio <= LONGER and guess <= MOST_SUBSTEPS:
+        ratio *= (control.substeps / guess) ** 2
+        error = control.error * ratio
+        known = Steps(Scheme(guess, control.stages), state.last_shift * ratio, error, error, False)
         return known, control._replace(trusted=control.trusted - 1)
     key = prepared.key(control.interval + 1, PILOT)
     chosen = np.empty(PILOTS, np.int32)
     systematic(np.exp(state.log_weights), uniform_number(key), chosen)
     pilots = Pilots(taken(state.particles, chosen), mean, scale, int(key[0] >> np.uint64(2)))
     found = steps_of(prepared.motion, interval, values, pilots, guess)
-    trusted = TRUSTED if found.surely <= SURE * TIME_ERROR else TRUSTED_LESS if found.error <= SURE * TIME_ERROR else 0
-    scheme = found.scheme
-    changed = control._replace(
-        substeps=scheme.substeps / length, stages=scheme.stages, error=found.error, length=length, trusted=trusted
+    count, stages = found.scheme
+    # The more often the error was what had been expected, the longer it is.
+    expected = count * np.sqrt(found.error / TIME_ERROR) <= FORESEEN * needed
+    streak = min(2 * control.streak + 1, TRUSTED) if expected else 0
+    trusted = TRUSTED if found.surely <= SURE * TIME_ERROR else streak
+    return found, control._replace(
+        substeps=count, stages=stages, error=found.error, length=length, trusted=trusted, streak=streak
     )
-    return found, changed
 
 
 def _carried(motion: Motion, events: Events, mean: Array, shift: Array) -> Array:

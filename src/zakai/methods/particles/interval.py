@@ -305,13 +305,14 @@ def noise_about_middle(A: Array, G: Array, length: float) -> Array:
 class Steps(NamedTuple):
     """The scheme of an interval, the shift (n,) of the mean that it leaves, and its error in standard deviations.
 
-    `surely` is the error with what a finite number of pilots leaves open.
+    `surely` is the error with what a finite number of pilots leaves open; not `measured` are those that follow from the last one.
     """
 
     scheme: Scheme
     shift: Array
     error: float
     surely: float
+    measured: bool = True
 
 
 class Pilots(NamedTuple):
