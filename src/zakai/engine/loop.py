@@ -123,8 +123,11 @@ def joined(parts: Sequence[Infos]) -> Infos:
 
 def size_of(state: Any) -> int:
     """Return the bytes of the arrays of a state, or of several."""
-    state = state.parts if isinstance(state, Joined) else state
-    return sum(map(size_of, state)) if isinstance(state, tuple | list) else getattr(state, "nbytes", 8)
+    if isinstance(state, np.ndarray):
+        return state.nbytes
+    if isinstance(state, tuple | list):
+        return sum(map(size_of, state))
+    return size_of(state.parts) if isinstance(state, Joined) else getattr(state, "nbytes", 8)
 
 
 class Run:

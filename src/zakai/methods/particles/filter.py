@@ -55,18 +55,18 @@ INFORMED = 0.25  # log det of the linearised posterior of the noise, below which
 MOST_LEVELS = 60
 FAR = 1e100  # a state that has left every bounded set
 FEW_FAMILIES = 20  # of the oldest generation that is looked back to, below which they are too few to show their spread
-# Standard error of a mean times sqrt(N) in standard deviations (1 for independent draws) from which the past is moved.  A move
-# costs as much as the intervals of its window: it waits until the squares of these figures, in units of that of `MOVE_ABOVE`,
-# add up to this share of the intervals of the last move.  What a move leaves is counted as the unit where it is more, for moves
-# cannot lower it: the figure must exceed it by `MOVE_GAIN`, and it is forgotten at a rate.
-MOVE_ABOVE, MOVE_SHARE, MOVE_GAIN, FORGOTTEN = 2.5, 0.4, 3.0, 0.98
+# The past is moved where that pays: by error^2 x time, with N variance of a mean, in variances of the state, as error^2.  What a
+# move takes away, for as many steps as there were since the last one, is compared with its cost, both as shares of all so far.
+# It costs so many steps for each interval of its window.  What it left is the least that a later one can leave; moves that
+# would take less than a third away are not made, and what was left is forgotten at a rate.
+MOVE_COST, MOVE_GAIN, FORGOTTEN = 1.0, 1.5, 0.98
 MOVE_CONTROL = (1.0, 1.2, 4.0, 0.4, 1.0)  # power, change, most sweeps, rho, share
 VARIANCE = 5.0  # that of a mean times N, in variances of the state, that the number of particles is chosen for
 MOST_GROWTH = 4
-# Share of the allowed time error below which its measurement is trusted in so many more intervals, if it is certain or not, and
-# the ratio of the errors of two lengths up to which that holds.
 REPEATED, NARROWEST = 2.0, 0.02  # excess of the time error at which an interval is repeated, and least narrowing that counts
-SURE, TRUSTED, TRUSTED_LESS, LONGER = 0.5, 8, 2, 4.0
+# Of the time error: the share of the allowed one below which it holds in so many more intervals, the excess of substeps over
+# those that were expected up to which it holds twice as long as before, and the ratio of errors by length up to which it holds.
+SURE, TRUSTED, FORESEEN, LONGER = 0.5, 8, 1.3, 4.0
 
 
 def init(prepared: Prepared, prior: Any) -> State:
@@ -92,7 +92,7 @@ def _at_start(prepared: Prepared, particles: Array, first: Array, gaussian: tupl
     width = system.law.width if system.law is not None else system.factor.width  # type: ignore[union-attr]
     window = Window.begin(particles, first, gaussian, (width, len(prepared.motion.law[3])))
     logs, nothing = np.full(count, -np.log(count)), np.zeros(system.n)
-    control = Control(0, 0.0, 4, 0.0, 0.0, 0, 1.0, VARIANCE, 0, 0.0, 0.0, 0, 0.0)
+    control = Control(0, 1, 4, 0.0, 0.0, 0, 0, 1.0, VARIANCE, 0.0, 0.0, 0, 1.0, 0, 0.0)
     return State(particles, logs, window, Genealogy.begin(count), control, nothing, nothing, np.ones(system.n))
 
 
@@ -215,7 +215,7 @@ def _step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[Stat
         if last_turn or steps.error * narrow <= REPEATED * TIME_ERROR * found_narrow:
             break
         narrow = found_narrow
-    measured = state.last_scale if steps.shift is state.last_shift else narrow * scale
+    last = (steps.shift, narrow * scale) if steps.measured else (state.last_shift, state.last_scale)
     if done.lost > 0.5 * RARE:
         check_escape(prepared, k, at_start)
     cloud = done.cloud
@@ -228,18 +228,17 @@ def _step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[Stat
     found = variances(cloud.genealogy, weights, deviations)
     doubtful = size < TEMPER_BELOW * len(weights) or done.levels > 3
     acceptance, moved = done.acceptance, 0.0
-    last, floor = control.last, max(FORGOTTEN * control.floor, 1.0 / MOVE_GAIN)
-    factor = _excess(found.largest, cov, len(weights))
-    urgency = control.urgency + factor / max(floor, 1.0)
-    if factor > MOVE_GAIN * floor and urgency >= MOVE_SHARE * last and cloud.window.width:
+    loss = _loss(found.largest, cov, len(weights))
+    floor, since = max(FORGOTTEN * control.floor, 1.0), control.since + 1
+    losses, work = control.losses + loss, control.work + 1.0
+    cost = MOVE_COST * cloud.window.length
+    gain = (loss - floor) * since
+    if loss > MOVE_GAIN * floor and gain * work > cost * losses and cloud.window.width:
         cloud, acceptance, doubtful_move = _moved(prepared, cloud, weights, number)
         weights = np.exp(cloud.logs)
         mean, deviations, cov, own = _moments(system, cloud.particles, weights)
         found = variances(cloud.genealogy, weights, deviations)
-        floor = _excess(found.largest, cov, len(weights))
-        # A move that gained little is repeated when there is more to gain.
-        floor *= max(1.0, MOVE_GAIN * floor / factor)
-        last, urgency, moved = cloud.window.length, 0.0, 1.0
+        floor, since, work, moved = _loss(found.largest, cov, len(weights)), 0, work + cost, 1.0
         doubtful = doubtful or doubtful_move
     spread = np.sqrt(np.maximum(np.diag(cov), 0.0))
     # What the weights say of a coordinate makes a shift of the prediction smaller by the ratio of the variances.
@@ -272,10 +271,10 @@ def _step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[Stat
     info = Info(done.gained, mean[:n], cov, health, np.sqrt(found.largest + shift[:n] ** 2), float(np.sqrt(evidence)))
     variance = 0.8 * control.variance + 0.2 * len(weights) * float(share.mean())
     control = control._replace(
-        interval=number, narrow=found_narrow, variance=variance, last=last, urgency=urgency, floor=floor, doubtful_until=until,
-        shifted=shifted,
+        interval=number, narrow=found_narrow, variance=variance, losses=losses, work=work, since=since, floor=floor,
+        doubtful_until=until, shifted=shifted,
     )  # fmt: skip
-    return State(cloud.particles, cloud.logs, cloud.window, cloud.genealogy, control, shift, steps.shift, measured), info
+    return State(cloud.particles, cloud.logs, cloud.window, cloud.genealogy, control, shift, *last), info
 
 
 def _steps(
@@ -284,26 +283,31 @@ def _steps(
     """Return the substeps of an interval, measured where the last measurement does not hold any more, and the controls."""
     control, (mean, scale), hold = state.control, about, prepared.model.input_hold
     length = interval.stop - interval.start
-    guess = min(max(1, round(control.substeps * length)), MOST_SUBSTEPS)
     if length <= 0:
         return Steps(Scheme(1, 4), np.zeros(len(mean)), 0.0, 0.0), control
     # The error of an interval is of the third order of its length, and was measured in deviations of that time.
-    ratio = (length / control.length) ** 3 if control.trusted and not interval.inputs_change(hold) else np.inf
+    ratio = (length / control.length) ** 3 if control.length and not interval.inputs_change(hold) else np.inf
     ratio *= max(1.0, float((state.last_scale / scale).max()))
-    if ratio <= LONGER and control.error * ratio <= SURE * TIME_ERROR:
-        known = Steps(Scheme(guess, control.stages), state.last_shift, control.error, control.error)
+    needed = control.substeps * np.sqrt(control.error * ratio / TIME_ERROR)
+    guess = max(1, int(np.ceil(needed))) if needed <= MOST_SUBSTEPS else max(1, control.substeps)
+    if control.trusted and ratio <= LONGER and guess <= MOST_SUBSTEPS:
+        ratio *= (control.substeps / guess) ** 2
+        error = control.error * ratio
+        known = Steps(Scheme(guess, control.stages), state.last_shift * ratio, error, error, False)
         return known, control._replace(trusted=control.trusted - 1)
     key = prepared.key(control.interval + 1, PILOT)
     chosen = np.empty(PILOTS, np.int32)
     systematic(np.exp(state.log_weights), uniform_number(key), chosen)
     pilots = Pilots(taken(state.particles, chosen), mean, scale, int(key[0] >> np.uint64(2)))
     found = steps_of(prepared.motion, interval, values, pilots, guess)
-    trusted = TRUSTED if found.surely <= SURE * TIME_ERROR else TRUSTED_LESS if found.error <= SURE * TIME_ERROR else 0
-    scheme = found.scheme
-    changed = control._replace(
-        substeps=scheme.substeps / length, stages=scheme.stages, error=found.error, length=length, trusted=trusted
+    count, stages = found.scheme
+    # The more often the error was what had been expected, the longer it is.
+    expected = count * np.sqrt(found.error / TIME_ERROR) <= FORESEEN * needed
+    streak = min(2 * control.streak + 1, TRUSTED) if expected else 0
+    trusted = TRUSTED if found.surely <= SURE * TIME_ERROR else streak
+    return found, control._replace(
+        substeps=count, stages=stages, error=found.error, length=length, trusted=trusted, streak=streak
     )
-    return found, changed
 
 
 def _carried(motion: Motion, events: Events, mean: Array, shift: Array) -> Array:
@@ -455,11 +459,11 @@ def _tempered(prepared: Prepared, target: Target, cloud: Cloud, drawn: Drawn, nu
     return Advanced(after, gained, noise, *drawn.after[3:5], levels, guided, float(np.mean(rates)), drawn.after.lost)
 
 
-def _excess(variance: Array, cov: Array, count: int) -> float:
-    """Return the largest variance of a mean over that of independent draws, in units of `MOVE_ABOVE` squared."""
+def _loss(variance: Array, cov: Array, count: int) -> float:
+    """Return the variances of the means over those of independent draws, in the mean of the states."""
     spread = np.diag(cov)
     wide = spread > 0
-    return float((variance[wide] / spread[wide]).max(initial=0.0)) * count / MOVE_ABOVE**2
+    return float((variance[wide] / spread[wide]).mean()) * count if wide.any() else 0.0
 
 
 def _moved(prepared: Prepared, cloud: Cloud, weights: Array, number: int) -> tuple[Cloud, float, bool]:

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.linalg import expm
 
 from zakai.methods.particles.programs import Array, Expressions
-from zakai.methods.particles.system import System, root
+from zakai.methods.particles.system import System, roots
 from zakai.numerics.particles.chunks import over_chunks
 from zakai.numerics.particles.formulas import evaluate
 from zakai.numerics.particles.motion import ADDITIVE, ORDERED, UPDATE, Arrival, advance
@@ -145,7 +145,7 @@ class Motion:
                 self._kept_roots.clear()
             nothing = np.zeros((self.system.m, self.system.m))
             G = self.covariance(float(self.system.model.start), nothing, None)
-            self._kept_roots[step] = root(noise_about_middle(self.constant_matrix, G, step))
+            self._kept_roots[step] = roots(noise_about_middle(self.constant_matrix[None], G[None], step))[0]
         return self._kept_roots[step]
 
     def covariance(self, t: float, P: Array, u: Array | None) -> Array:
@@ -168,16 +168,16 @@ class Motion:
         """The matrix of an affine drift."""
         model = self.system.model
         given = np.zeros(self.system.drift.width)
-        return self.matrix(np.zeros(model.n), np.ones(model.n), float(model.start), given)
+        return np.asarray(self.matrices(np.zeros((1, model.n)), np.ones(model.n), float(model.start), given)[0])
 
-    def matrix(self, x: Array, scale: Array, t: float, given: Array) -> Array:
-        """Return df/dx (n, n) at a point, by forward differences."""
-        n = len(x)
+    def matrices(self, x: Array, scale: Array, t: float, given: Array) -> Array:
+        """Return df/dx (J, n, n) at points (J, n), by forward differences."""
+        count, n = x.shape
         step = 1e-5 * scale
-        points = np.repeat(x[:, None], n + 1, axis=1)
-        points[np.arange(n), np.arange(1, n + 1)] += step
-        f = self.values(self.arrays[0], points, t, given)[:n]
-        found = (f[:, 1:] - f[:, :1]) / step
+        points = np.repeat(x.T[:, :, None], n + 1, axis=2)
+        points[np.arange(n), :, np.arange(1, n + 1)] += step[:, None]
+        f = self.values(self.arrays[0], points.reshape(n, -1), t, given)[:n].reshape(n, count, n + 1)
+        found = ((f[:, :, 1:] - f[:, :, :1]) / step).transpose(1, 0, 2)
         return np.where(np.isfinite(found), found, 0.0)
 
     def events(self, interval: Interval, scheme: Scheme, values: Array, mean: Array, scale: Array) -> Events:
@@ -243,84 +243,85 @@ class Motion:
         self, interval: Interval, times: Array, places: Array, given: Array, step: float, mean: Array, scale: Array
     ) -> Array:
         """Return the roots of the noise of all substeps, (J, n, d), or (J, r, d) for the coefficients of fields."""
-        system, found = self.system, list[Array]()
+        system, kicks = self.system, np.flatnonzero(places[:, 0] >= 0)
         if system.kind == ADDITIVE and system.affine and not system.timed and system.cross is None:
             # Nothing but the length decides, and equal lengths are frequent.
-            known = self._root_of(step)
-            return np.repeat(known[None], int(places[:, 0].max()) + 1, axis=0)
-        known = None
+            return np.repeat(self._root_of(step)[None], len(kicks), axis=0)
+        covs = list[Array]()
+        for e in kicks if system.timed else kicks[:1]:
+            u = self._inputs(interval, times[e, 1], True)
+            P = np.zeros((system.m, system.m))
+            if system.cross is not None:
+                P = system.precision(times[e, 1], interval.inside, self.theta, u)
+            known = self.covariance if system.kind == ADDITIVE else self._own_noise
+            covs.append(known(times[e, 1], P, u))
+        G = np.array(covs)
+        if system.kind != ADDITIVE:
+            found = roots(G) * np.sqrt(step)
+            return np.ascontiguousarray(found if system.timed else np.repeat(found, len(kicks), axis=0))
         A = self._slopes(times, places, given, mean, scale)
-        for e in np.flatnonzero(places[:, 0] >= 0):
-            if known is None or system.timed or A is not None and not system.affine:
-                u = self._inputs(interval, times[e, 1], True)
-                P = np.zeros((system.m, system.m))
-                if system.cross is not None:
-                    P = system.precision(times[e, 1], interval.inside, self.theta, u)
-                if system.kind == ADDITIVE:
-                    G = self.covariance(times[e, 1], P, u)
-                    assert A is not None
-                    slope = A[len(found)]
-                    size = float(np.abs(slope).sum(axis=1).max()) * step
-                    if size > _CARRIED and not system.affine:
-                        slope = slope * (_CARRIED / size)
-                    known = root(noise_about_middle(slope, G, step))
-                else:
-                    known = root(system.own_noise(times[e, 1], P, self.theta, u)) * np.sqrt(step)
-            found.append(known)
-        width = max(one.shape[1] for one in found)
-        roots = np.zeros((len(found), system.r if system.kind else system.n, width))
-        for place, one in enumerate(found):
-            roots[place, :, : one.shape[1]] = one
-        return roots
+        if not system.affine:
+            size = np.abs(A).sum(axis=2).max(axis=1) * step
+            A = A * (_CARRIED / np.maximum(size, _CARRIED))[:, None, None]
+        return np.ascontiguousarray(roots(noise_about_middle(A, np.broadcast_to(G, A.shape), step)))
 
-    def _slopes(self, times: Array, places: Array, given: Array, mean: Array, scale: Array) -> list[Array] | None:
-        """Return df/dx at the kicks along the path of a state without noise."""
+    def _own_noise(self, t: float, P: Array, u: Array | None) -> Array:
+        return self.system.own_noise(t, P, self.theta, u)
+
+    def _slopes(self, times: Array, places: Array, given: Array, mean: Array, scale: Array) -> Array:
+        """Return df/dx (J, n, n) at the kicks along the path of a state without noise."""
         system = self.system
         kicks = np.flatnonzero(places[:, 0] >= 0)
-        if system.kind != ADDITIVE:
-            return None
         if system.affine:
-            return [self.constant_matrix] * len(kicks)
+            return np.repeat(self.constant_matrix[None], len(kicks), axis=0)
         marked = np.column_stack([np.full(len(places), -1), places[:, 0], places[:, 2]]).astype(np.int64)
         none = Events(times, marked, given, np.zeros((0, system.n, 0)), np.zeros((0, 3), np.int64))
         ends = np.zeros((len(kicks), system.n, 1))
         self.advanced(none, np.ascontiguousarray(mean[:, None]), np.zeros((0, 1)), ends)
-        return [self.matrix(ends[j, :, 0], scale, times[e, 1], given[e, 1]) for j, e in enumerate(kicks)]
+        if not (system.timed or system.driven):
+            return self.matrices(ends[:, :, 0], scale, times[0, 1], given[0, 1])
+        found = [self.matrices(ends[j, None, :, 0], scale, times[e, 1], given[e, 1]) for j, e in enumerate(kicks)]
+        return np.concatenate(found)
 
 
 def noise_about_middle(A: Array, G: Array, length: float) -> Array:
-    """Return int exp(-s A) G exp(-s A') ds over (-length/2, length/2): the noise of a substep, carried to its middle."""
-    size = float(np.abs(A).sum(axis=1).max(initial=0.0)) * length
+    """Return int exp(-s A) G exp(-s A') ds over (-length/2, length/2): the noise of a substep, carried to its middle.
+
+    A and G are matrices (J, n, n).
+    """
+    size = float(np.abs(A).sum(axis=2).max(initial=0.0)) * length
     if size <= _SERIES:
         term, total, factor = G, length * G, length
         for k in range(1, 40):
-            term = -(A @ term + term @ A.T)
+            change = A @ term
+            term = -(change + change.transpose(0, 2, 1))
             factor = factor * 0.5 * length / (k + 1)
             if k % 2 == 0:
                 change = factor * term
                 total = total + change
                 if np.abs(change).max() <= 1e-15 * np.abs(total).max():
                     break
-        return 0.5 * (total + total.T)
-    n = len(A)
-    block = np.block([[-A, G], [np.zeros((n, n)), A.T]])
+        return np.asarray(0.5 * (total + total.transpose(0, 2, 1)))
+    n = A.shape[1]
+    block = np.block([[-A, G], [np.zeros_like(A), A.transpose(0, 2, 1)]])
     E = expm(block * length)
-    F = E[n:, n:].T
+    F = E[:, n:, n:].transpose(0, 2, 1)
     back = expm(-0.5 * length * A)
-    Q = back @ (F @ E[:n, n:]) @ back.T
-    return 0.5 * (Q + Q.T)
+    Q = back @ (F @ E[:, :n, n:]) @ back.transpose(0, 2, 1)
+    return np.asarray(0.5 * (Q + Q.transpose(0, 2, 1)))
 
 
 class Steps(NamedTuple):
     """The scheme of an interval, the shift (n,) of the mean that it leaves, and its error in standard deviations.
 
-    `surely` is the error with what a finite number of pilots leaves open.
+    `surely` is the error with what a finite number of pilots leaves open; not `measured` are those that follow from the last one.
     """
 
     scheme: Scheme
     shift: Array
     error: float
     surely: float
+    measured: bool = True
 
 
 class Pilots(NamedTuple):

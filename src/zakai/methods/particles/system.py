@@ -212,12 +212,19 @@ def system_of(model: Model) -> System:
 
 
 def root(Q: Array) -> Array:
-    """Return columns R (n, d) with R R' = Q, without null directions.
+    """Return columns R (n, d) with R R' = Q, without null directions."""
+    return np.ascontiguousarray(roots(Q[None])[0])
 
-    The matrix is scaled to a unit diagonal first, so that a coordinate with little noise keeps it.
+
+def roots(Q: Array) -> Array:
+    """Return columns R (J, n, d) with R R' = Q for matrices (J, n, n), of which the last ones are zero where Q has null directions.
+
+    The matrices are scaled to a unit diagonal first, so that a coordinate with little noise keeps it.
     """
-    spread = np.sqrt(np.maximum(np.diag(Q), 0.0))
+    spread = np.sqrt(np.maximum(np.diagonal(Q, axis1=1, axis2=2), 0.0))
     scale = np.where(spread > 0, spread, 1.0)
-    values, vectors = np.linalg.eigh(Q / np.outer(scale, scale))
+    values, vectors = np.linalg.eigh(Q / (scale[:, :, None] * scale[:, None, :]))
     used = values > 1e-11
-    return np.ascontiguousarray(scale[:, None] * vectors[:, used] * np.sqrt(values[used]))
+    width = int(used.sum(axis=1).max(initial=0))
+    found = scale[:, :, None] * vectors * np.sqrt(np.where(used, values, 0.0))[:, None, :]
+    return np.asarray(found[:, :, ::-1][:, :, :width])

@@ -30,16 +30,16 @@ _SIGN = np.int64(-0x8000000000000000)
 _MANTISSA, _ONE = np.int64(0x000FFFFFFFFFFFFF), np.int64(0x3FF0000000000000)
 
 
-_native: Any = intrinsic  # its types count an argument too many
+_compiled: Any = intrinsic
 
 
-@_native
+@_compiled
 def _bits(context: Any, x: Any) -> Any:
     """Return the bits of a float64 as an int64."""
     return types.int64(types.float64), lambda _, builder, __, args: builder.bitcast(args[0], ir.IntType(64))
 
 
-@_native
+@_compiled
 def _number(context: Any, x: Any) -> Any:
     """Return the float64 with the bits of an int64."""
     return types.float64(types.int64), lambda _, builder, __, args: builder.bitcast(args[0], ir.DoubleType())
@@ -213,3 +213,20 @@ def square_row(a: Array, exponent: int, out: Array) -> None:
         u = a[i]
         square = u * u
         out[i] = square if exponent == 2 else square * (u if exponent == 3 else square)
+
+
+@helper
+def add_rows(out: Array, factors: Array, rows: Array, size: int) -> None:
+    """Add the sum of rows (J, size or more) times factors (J,) to a row, four at a time."""
+    count = factors.size
+    for j in range(0, count - 3, 4):
+        a, b, c, d = factors[j], factors[j + 1], factors[j + 2], factors[j + 3]
+        if a == 0.0 and b == 0.0 and c == 0.0 and d == 0.0:
+            continue
+        for i in range(size):
+            out[i] += (a * rows[j, i] + b * rows[j + 1, i]) + (c * rows[j + 2, i] + d * rows[j + 3, i])
+    for j in range(count - count % 4, count):
+        a = factors[j]
+        if a != 0.0:
+            for i in range(size):
+                out[i] += a * rows[j, i]

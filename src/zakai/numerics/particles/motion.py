@@ -21,6 +21,7 @@ from numba import types
 
 from zakai.numerics.compiled import helper, kernel
 from zakai.numerics.formula_kernel import BLOCK
+from zakai.numerics.particles.elementary import add_rows
 from zakai.numerics.particles.formulas import BOX, F1, F2, F3, I2, PROGRAM, block_of, load_point, mirrored, run_program
 
 Array = Any
@@ -96,58 +97,74 @@ def _runge_kutta(program: Any, values: Array, x: Array, box: Any, stretch: Any, 
     """Write the change of x (rows, size) by one Runge-Kutta step; mark the particles that it is too long for, and count them."""
     outputs, work, row, rough = program[3], buffers.work, buffers.row, buffers.rough
     length, times, given, stages, begin, part = stretch
-    count, rows = outputs.size, x.shape[0]
-    point, slopes, total = work[:rows], work[rows : rows + count], work[rows + count : rows + 2 * count]
-    excess = work[rows + 2 * count : rows + 3 * count]
+    count, rows, n = outputs.size, x.shape[0], box[0].size
+    point, total, excess = work[:rows], work[rows : rows + count], work[rows + count : rows + count + n]
     length = part * length
+    for d in range(count, rows):
+        for i in range(size):
+            point[d, i] = x[d, i]
     for stage in range(stages):
         share = 0.0 if stage == 0 else (1.0 if stage == 3 else 0.5)
-        if stage == 0:
-            for d in range(rows):
-                for i in range(size):
-                    point[d, i] = x[d, i]
-        else:
-            for d in range(count):
-                for i in range(size):
-                    point[d, i] = x[d, i] + share * length * slopes[d, i]
         at = begin + part * share
         for j in range(row.size):
             row[j] = given[0, j] + at * (given[1, j] - given[0, j])
-        load_point(program, values, point, box, times[0] + at * (times[1] - times[0]), row, size)
+        load_point(program, values, point if stage else x, box, times[0] + at * (times[1] - times[0]), row, size)
         run_program(program, values, size)
         weight = length / 6.0 if stage == 0 or stage == 3 else length / 3.0
         sign = length / 6.0 if stage == 0 or stage == 3 else -length / 6.0
         if stages == 2:
             weight = 0.0 if stage == 0 else length
             sign = 0.5 * length if stage == 0 else -0.5 * length
+        ahead = (1.0 if stage == 2 else 0.5) * length
         for d in range(count):
-            result = values[outputs[d]]
-            for i in range(size):
-                slopes[d, i] = result[i]
-                total[d, i] = weight * slopes[d, i] + (total[d, i] if stage else 0.0)
-                excess[d, i] = sign * slopes[d, i] + (excess[d, i] if stage else 0.0)
+            slope = values[outputs[d]]
+            if stage == 0:
+                for i in range(size):
+                    total[d, i] = weight * slope[i]
+            else:
+                for i in range(size):
+                    total[d, i] += weight * slope[i]
+            if d < n and stage == 0:
+                for i in range(size):
+                    excess[d, i] = sign * slope[i]
+            elif d < n:
+                for i in range(size):
+                    excess[d, i] += sign * slope[i]
+            if stage < stages - 1:
+                for i in range(size):
+                    point[d, i] = x[d, i] + ahead * slope[i]
     for i in range(size):
         rough[i] = 0.0
-    for d in range(box[0].size):
+    for d in range(n):
         for i in range(size):
-            fine = abs(excess[d, i]) <= _ROUGH * (abs(x[d, i]) + abs(x[d, i] + total[d, i]))
-            rough[i] += 0.0 if fine else 1.0  # NaN is rough, too
-    marked = 0
+            end = x[d, i] + total[d, i]
+            rough[i] += 0.0 if abs(excess[d, i]) <= _ROUGH * (abs(x[d, i]) + abs(end)) else 1.0  # NaN is rough, too
+    marked = 0.0
     for i in range(size):
-        marked += rough[i] > 0.0
-    return marked
+        marked = max(marked, rough[i])
+    if marked == 0.0:
+        return 0
+    left = 0
+    for i in range(size):
+        left += rough[i] > 0.0
+    return left
 
 
 @helper
 def _flow(program: Any, values: Array, x: Array, box: Any, stretch: Any, buffers: Any, size: int) -> None:
     """Advance the first rows of x (rows, size) by one Runge-Kutta step, or by as many as a particle needs to be stable."""
     count, rows, rough = program[3].size, x.shape[0], buffers.rough
-    change = buffers.work[rows + count : rows + 2 * count]
+    change = buffers.work[rows : rows + count]
     left = _runge_kutta(program, values, x, box, stretch, buffers, size)
-    marked, few = buffers.marked, buffers.work[rows + 3 * count : 2 * rows + 3 * count]
+    if left == 0:
+        for d in range(count):
+            for i in range(size):
+                x[d, i] += change[d, i]
+        return
+    marked, few = buffers.marked, buffers.work[rows + 2 * count : 2 * rows + 2 * count]
     place = 0
     for i in range(size):
-        if left and rough[i] > 0.0:
+        if rough[i] > 0.0:
             marked[place] = i
             place += 1
         else:
@@ -187,11 +204,7 @@ def _kick(motion: Any, values: Array, x: Array, kick: Any, buffers: Any, size: i
     n, width = motion[2][0].size, root.shape[1]
     if kind == ADDITIVE:
         for d in range(n):
-            for j in range(width):
-                factor = root[d, j]
-                if factor != 0.0:
-                    for i in range(size):
-                        x[d, i] += factor * noise[j, i]
+            add_rows(x[d], root[d], noise, size)
         return
     # The point of the fields: the state, then a coefficient for each field.
     r = root.shape[0]

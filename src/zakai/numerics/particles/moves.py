@@ -23,6 +23,7 @@ from numba import types
 from zakai.numerics.compiled import helper, kernel
 from zakai.numerics.formula_kernel import BLOCK
 from zakai.numerics.particles.chunks import CHUNK
+from zakai.numerics.particles.elementary import add_rows
 from zakai.numerics.particles.formulas import F1, F2, PROGRAM, block_of, load_point, run_program
 from zakai.numerics.particles.motion import EVENTS, MOTION, buffers_of, run_event
 from zakai.numerics.particles.random import KEY, fill_normals, fill_row, uniform
@@ -135,20 +136,30 @@ def _mean(gaussian: Any, start: Array, out: Array, size: int) -> None:
 
 @helper
 def _scale(gaussian: Any, inverse: bool, given: Array, along: Array, size: int) -> None:
-    """Multiply columns (D, size) by U, or by its inverse; `along` (size,) is overwritten."""
+    """Multiply columns (D, size) by U, or by its inverse; `along` (r, size) is overwritten."""
     V, factors = gaussian[3], gaussian[4]
+    changes = np.empty(factors.size)
     for k in range(factors.size):
         factor = (1.0 / factors[k] if inverse else factors[k]) - 1.0
         for i in range(size):
-            along[i] = 0.0
-        for r in range(V.shape[1]):
-            entry = V[k, r]
-            for i in range(size):
-                along[i] += entry * given[r, i]
-        for r in range(V.shape[1]):
-            entry = factor * V[k, r]
-            for i in range(size):
-                given[r, i] += entry * along[i]
+            along[k, i] = 0.0
+        add_rows(along[k], V[k], given, size)
+        for i in range(size):
+            along[k, i] *= factor
+    for r in range(V.shape[1]):
+        for k in range(factors.size):
+            changes[k] = V[k, r]
+        add_rows(given[r], changes, along, size)
+
+
+@helper
+def _norms(rows: Array, count: int, begin: float, out: Array, size: int) -> None:
+    """Write a number less half of the sums of squares of the first rows."""
+    for i in range(size):
+        out[i] = begin
+    for r in range(count):
+        for i in range(size):
+            out[i] -= 0.5 * rows[r, i] ** 2
 
 
 @kernel(types.void(WINDOW_LAW, F2, F2, types.int64, types.int64, F2, F1))
@@ -160,47 +171,54 @@ def follow(window: Any, start: Array, path: Array, low: int, high: int, out: Arr
     own, begin = np.empty((D + 1, BLOCK)), np.empty((n, BLOCK))
     for first in range(low, high, BLOCK):
         size = min(BLOCK, high - first)
-        begin[:, :size] = start[:, first : first + size]
-        own[:D, :size] = path[:, first : first + size]
+        for d in range(n):
+            for i in range(size):
+                begin[d, i] = start[d, first + i]
+        for r in range(D):
+            for i in range(size):
+                own[r, i] = path[r, first + i]
         _follow(window, workspace, begin, own, x, found, size)
-        out[:, first : first + size] = x[:n, :size]
-        total[first : first + size] = found[:size]
+        for d in range(n):
+            for i in range(size):
+                out[d, first + i] = x[d, i]
+        for i in range(size):
+            total[first + i] = found[i]
 
 
 @kernel(types.void(GAUSSIAN, types.float64, KEY, F2, types.int64, types.int64, F2, F1))
 def draw(gaussian: Any, share: float, key: Array, start: Array, low: int, high: int, path: Array, ratio: Array) -> None:
     """Write noise (D, N) drawn from share N(0, I) + (1 - share) N(m, U^-2), and log N(0, I) less the log of that density."""
-    D, along = path.shape[0], np.empty(BLOCK)
+    n, D, along = start.shape[0], path.shape[0], np.empty((gaussian[4].size, BLOCK))
     w, p, m = np.empty((D, BLOCK)), np.empty((D, BLOCK)), np.empty((D, BLOCK))
+    begin, qs, phis, plain = np.empty((n, BLOCK)), np.empty(BLOCK), np.empty(BLOCK), np.empty(BLOCK, np.bool_)
     log_det = 0.0
     for factor in gaussian[4]:
         log_det += math.log(factor)
     for first in range(low, high, BLOCK):
         size = min(BLOCK, high - first)
         fill_normals(key, first, size, w)
-        _mean(gaussian, start[:, first : first + size], m, size)
-        p[:, :size] = w[:, :size]
+        for d in range(n):
+            for i in range(size):
+                begin[d, i] = start[d, first + i]
+        _mean(gaussian, begin, m, size)
+        for i in range(size):
+            plain[i] = uniform(key, _ACCEPTANCE + np.uint64(first + i)) < share
+        for r in range(D):
+            for i in range(size):
+                p[r, i] = w[r, i]
         _scale(gaussian, True, p, along, size)
         for r in range(D):
             for i in range(size):
-                p[r, i] += m[r, i]
-        for i in range(size):
-            if uniform(key, _ACCEPTANCE + np.uint64(first + i)) < share:
-                for r in range(D):
-                    p[r, i] = w[r, i]
-        for r in range(D):
-            for i in range(size):
+                p[r, i] = w[r, i] if plain[i] else p[r, i] + m[r, i]
+                path[r, first + i] = p[r, i]
                 m[r, i] = p[r, i] - m[r, i]
         _scale(gaussian, False, m, along, size)
+        _norms(m, D, log_det, qs, size)
+        _norms(p, D, 0.0, phis, size)
         for i in range(size):
-            q = log_det
-            phi = 0.0
-            for r in range(D):
-                q -= 0.5 * m[r, i] ** 2
-                phi -= 0.5 * p[r, i] ** 2
+            q, phi = qs[i], phis[i]
             top = max(q, phi)
             ratio[first + i] = phi - top - math.log((1.0 - share) * math.exp(q - top) + share * math.exp(phi - top))
-        path[:, first : first + size] = p[:, :size]
 
 
 @kernel(types.void(WINDOW_LAW, GAUSSIAN, F1, KEY, types.int64, types.int64, PATHS))
@@ -225,10 +243,11 @@ def sweep(window: Any, gaussian: Any, control: Array, key: Array, low: int, high
     for factor in gaussian[4]:
         log_det += math.log(factor)
     workspace = _workspace(window)
-    along = np.empty(BLOCK)
+    along = np.empty((gaussian[4].size, BLOCK))
     x, found = np.empty((window.motion[0][3].size, BLOCK)), np.empty(BLOCK)
     begin, new, fresh, m = np.empty((n, BLOCK)), np.empty((D + 1, BLOCK)), np.empty((D, BLOCK)), np.empty((D, BLOCK))
     w, target = np.empty((D, CHUNK)), np.empty(CHUNK)
+    gs, phis, taken = np.empty(BLOCK), np.empty(BLOCK), np.empty(BLOCK, np.bool_)
     for chunk in range(low, high, CHUNK):
         end = min(chunk + CHUNK, high)
         rho, done, rates, count = control[3], 0.0, 0.0, 0
@@ -237,48 +256,51 @@ def sweep(window: Any, gaussian: Any, control: Array, key: Array, low: int, high
             accepted, s = 0, math.sqrt(1.0 - rho * rho)
             for first in range(chunk, end, BLOCK):
                 size, at = min(BLOCK, end - first), first - chunk
-                begin[:, :size] = start[:, first : first + size]
+                for d in range(n):
+                    for i in range(size):
+                        begin[d, i] = start[d, first + i]
                 _mean(gaussian, begin, m, size)
-                if turn < 0:
-                    new[:D, :size] = path[:, first : first + size]
-                    fresh[:, :size] = new[:D, :size] - m[:, :size]
-                    _scale(gaussian, False, fresh, along, size)
-                    w[:, at : at + size] = fresh[:, :size]
-                else:
-                    row = turn * D
-                    for r in range(D):
-                        fill_row(key, row + r, first, size, fresh[r])
+                for r in range(D):
+                    if turn < 0:
+                        for i in range(size):
+                            new[r, i] = path[r, first + i]
+                            fresh[r, i] = new[r, i] - m[r, i]
+                    else:
+                        fill_row(key, turn * D + r, first, size, fresh[r])
                         for i in range(size):
                             fresh[r, i] = rho * w[r, at + i] + s * fresh[r, i]
-                    new[:D, :size] = fresh[:, :size]
-                    _scale(gaussian, True, new, along, size)
-                    for r in range(D):
-                        for i in range(size):
-                            new[r, i] += m[r, i]
+                            new[r, i] = fresh[r, i]
+                _scale(gaussian, turn >= 0, new if turn >= 0 else fresh, along, size)
+                for r in range(D if turn >= 0 else 0):
+                    for i in range(size):
+                        new[r, i] += m[r, i]
                 _follow(window, workspace, begin, new, x, found, size)
+                _norms(fresh, D, log_det, gs, size)
+                _norms(new, D, 0.0, phis, size)
                 for i in range(size):
-                    g, phi = log_det, 0.0
-                    for r in range(D):
-                        g -= 0.5 * fresh[r, i] ** 2
-                        phi -= 0.5 * new[r, i] ** 2
+                    g, phi = gs[i], phis[i]
                     top = max(g, phi)
                     q = phi if part == 1.0 else top + math.log((1.0 - part) * math.exp(g - top) + part * math.exp(phi - top))
                     found[i] += phi - q
                     value = power * found[i] + q - g
                     if not value < np.inf:
                         value = -np.inf
+                    taken[i] = turn < 0
                     if turn >= 0:
                         u = uniform(key, _ACCEPTANCE + (np.uint64(turn) << np.uint64(32)) + np.uint64(first + i))
-                        if not math.log(u) < value - target[at + i]:
-                            continue
-                        accepted += 1
-                    target[at + i] = value
-                    total[first + i] = found[i]
-                    for r in range(D):
-                        w[r, at + i] = fresh[r, i]
-                        path[r, first + i] = new[r, i]
-                    for d in range(n):
-                        out[d, first + i] = x[d, i]
+                        taken[i] = math.log(u) < value - target[at + i]
+                        accepted += taken[i]
+                    if taken[i]:
+                        target[at + i] = value
+                        total[first + i] = found[i]
+                for r in range(D):
+                    for i in range(size):
+                        w[r, at + i] = fresh[r, i] if taken[i] else w[r, at + i]
+                    for i in range(size):
+                        path[r, first + i] = new[r, i] if taken[i] else path[r, first + i]
+                for d in range(n):
+                    for i in range(size):
+                        out[d, first + i] = x[d, i] if taken[i] else out[d, first + i]
             if turn < 0:
                 continue
             rate = accepted / (end - chunk)
