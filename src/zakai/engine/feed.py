@@ -132,7 +132,10 @@ class Feed:
         observed = np.array([seen])
         inputs = None if inputs is None else inputs.part(start, stop)
         schedule = Schedule(np.array([start]), np.array([stop]), observed, np.where(observed, [elapsed], 0.0), inputs)
-        prepared = setting.method.prepare(setting.model, schedule, setting.theta, **setting.options)
+        if inputs is None and setting.method.rescheduled is not None:
+            prepared = setting.method.rescheduled(self.empty, schedule)
+        else:
+            prepared = setting.method.prepare(setting.model, schedule, setting.theta, **setting.options)
         noise = notes_on_noise(setting.model, schedule) if self._noise_varies else ()
         return prepared, (*noise, *prepared.notes)
 

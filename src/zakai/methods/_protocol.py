@@ -33,6 +33,7 @@ import numpy as np
 from zakai.algebra.conditions import Condition
 from zakai.densities import Density
 from zakai.models.model import Model
+from zakai.records.schedule import Schedule
 
 
 class Info(NamedTuple):
@@ -216,6 +217,9 @@ class Method(Generic[P, S]):
     of which one has an infinitesimal imaginary part.  It returns the states after each step, their Infos, the derivatives (p,) of
     the sum of what they gained, and the last shifted states; or None, where `step` is to carry them.
 
+    Optional: `rescheduled(prepared, schedule)` returns what `prepare` returns for another schedule of the same model, parameters
+    and options, without what does not depend on the schedule; an online filter asks it for one interval after the other.
+
     Optional: `backward` is the backward pass of `zakai.smooth`.
 
     Optional: `reduced(state)` returns a state of which only the density and the backward pass are asked, without what the next
@@ -244,5 +248,6 @@ class Method(Generic[P, S]):
     valid: Callable[[P, S], bool] | None = None
     segment: Callable[[P, slice, S, np.ndarray], tuple[Sequence[S], Infos] | None] | None = None
     tangents: Callable[[P, Sequence[P], slice, S, Sequence[S], np.ndarray], Tangents[S] | None] | None = None
+    rescheduled: Callable[[P, Schedule], P] | None = None
     backward: Backward[P, S, Any] | None = None
     reduced: Callable[[S], S] | None = None

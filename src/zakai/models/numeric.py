@@ -124,9 +124,8 @@ def numpy_function(expressions: Any, model: Model, shape: Sequence[int] | None =
             raise InputError(f"{model.source}: inputs: the values of {', '.join(model.inputs)} are missing")
         x, t, theta = (_inexact(a) for a in (x, t, theta))
         u, z = (None if a is None else np.asarray(a, dtype=float) for a in (u, z))
-        batch = np.broadcast_shapes(
-            x.shape[:-1], t.shape, theta.shape[:-1], *(a.shape[:-1] for a in (u, z) if a is not None)
-        )
+        shapes = {x.shape[:-1], t.shape, theta.shape[:-1], *(a.shape[:-1] for a in (u, z) if a is not None)} - {()}
+        batch = shapes.pop() if len(shapes) == 1 else np.broadcast_shapes(*shapes)
         derivative = np.iscomplexobj(x) or np.iscomplexobj(t) or np.iscomplexobj(theta)
         with np.errstate(all="ignore"):
             values = program.run(x, t, theta, COMPLEX if derivative else REAL, u, z)

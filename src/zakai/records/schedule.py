@@ -80,6 +80,8 @@ def lengths_of(starts: np.ndarray, stops: np.ndarray) -> np.ndarray:
 
     A length depends on its own interval alone, so that it is the same online and in a record.
     """
+    if len(starts) == 1:  # of an online filter
+        return np.array([length_of(float(starts[0]), float(stops[0]))])
     lengths = stops - starts
     exponents = np.frexp(np.maximum(np.abs(starts), np.abs(stops)))[1]
     unit = np.ldexp(1.0, np.maximum(exponents - 50, -1000))

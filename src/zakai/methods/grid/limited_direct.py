@@ -72,16 +72,14 @@ def prepare(
         options: dict[str, Any] = {"splitting": splitting, "tolerance": tolerance, "kernel": kernel, "order": order}
         return space_direct.prepare(model, schedule, theta, **options)
     prepared = line_filter.prepare(model, schedule, theta, tolerance_of(tolerance, 1e-9), in_pieces(model))
-    yau, lie = yau_line_of(model), splitting == "lie"
     prior = model.prior
-    origin = float(prior.mean[0]) if isinstance(prior, GaussianPrior | MixturePrior) else 0.0
-    inside = prepared.inside & (prepared.inside.all(axis=1, keepdims=True) if lie else True)
-    power_series = power_series_of(model, order) if series else None
-    return replace(
+    prepared = replace(
         prepared, promised=1e-7 if tolerance is None else prepared.tolerance, generous=256 if model.periodic else 128,
-        yau=yau, kernels=yau.kernels(schedule.starts, prepared.lengths, inside, theta, lie, origin, power_series),
-        lie=lie, origin=origin, series=power_series,
+        yau=yau_line_of(model), lie=splitting == "lie", series=power_series_of(model, order) if series else None,
+        origin=float(prior.mean[0]) if isinstance(prior, GaussianPrior | MixturePrior) else 0.0,
     )  # fmt: skip
+    prepared.kernels  # noqa: B018  # which fails where a series does not hold
+    return prepared
 
 
 def variant(model: Model, options: Mapping[str, Any]) -> Method[Any, Any]:
@@ -109,5 +107,6 @@ METHOD: Method[Any, Any] = Method(
     handles=features.OF_OBSERVATION | {features.INPUTS, features.JUMPS, features.KINKS, features.SINC, features.TABLES},
     segment=line_filter.segment,
     tangents=line_tangents.tangents,
+    rescheduled=line_filter.rescheduled,
     backward=LINE,
 )

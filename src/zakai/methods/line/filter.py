@@ -41,7 +41,6 @@ from zakai.methods.line.update import (
     state_of,
 )
 from zakai.methods.line.update import init as init
-from zakai.methods.system.notes import OMITTED
 from zakai.models.model import Model
 from zakai.numerics.line import window as lw
 from zakai.numerics.line.density import separated
@@ -66,12 +65,14 @@ def prepare(model: Model, schedule: Schedule, theta: np.ndarray, tolerance: floa
     if system.kinked_drift and not pieces:  # the spectrum of a density falls slowly
         negligible = max(negligible, SLOW * tolerance)
     generous = SHARED if system.samples and not system.moving else GENEROUS
-    result = Prepared(
-        model, schedule, theta, system, tolerance, schedule.lengths, schedule.inside, negligible, generous, tolerance,
-        notes=(OMITTED,) if system.cross is not None and (schedule.seen & ~schedule.inside).any() else (), pieces=pieces,
-    )  # fmt: skip
+    result = Prepared(model, schedule, theta, system, tolerance, negligible, generous, tolerance, pieces=pieces)
     # With kinks a grid is finer, and another one takes long to prepare.
     return replace(result, generous=SLOW_GENEROUS) if result.kinked else result
+
+
+def rescheduled(prepared: Prepared, schedule: Schedule) -> Prepared:
+    """Return what is prepared for another schedule, with the same inputs."""
+    return prepared.over(schedule)
 
 
 def step(prepared: Prepared, k: int, state: State, observed: np.ndarray) -> tuple[State, Info]:

@@ -260,9 +260,9 @@ def system_of(model: Model) -> System:
     return System(model)
 
 
-def within(times: Array, start: float, stop: float) -> Array:
+def within(times: Array, start: Array | float, stop: Array | float) -> Array:
     """Return times of a piece, in which the end counts as the limit from inside."""
-    return np.clip(times, start, np.nextafter(stop, start))
+    return np.minimum(np.maximum(times, start), np.nextafter(stop, start))
 
 
 def finite(values: Array) -> Array:

@@ -8,7 +8,7 @@ was gathered over more than the interval, belongs to the last part.
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -16,8 +16,9 @@ import numpy as np
 
 from zakai.methods._protocol import Infos
 from zakai.methods.line.cache import CacheKey, Derived, GridCache, grid_cache_of
-from zakai.methods.line.model import System, finite
+from zakai.methods.line.model import System, finite, within
 from zakai.methods.line.yau import Kernels, YauLine
+from zakai.methods.system.notes import OMITTED
 from zakai.methods.yau.kernel import PowerSeries
 from zakai.models.model import Model
 from zakai.models.prior import GaussianPrior
@@ -111,20 +112,48 @@ class Prepared:
     theta: np.ndarray
     system: System
     tolerance: float
-    lengths: np.ndarray
-    inside: np.ndarray
     negligible: float
     generous: int
     promised: float
     yau: YauLine | None = None
-    kernels: Kernels | None = None
     lie: bool = False
     origin: float = 0.0
     series: PowerSeries | None = None
-    notes: tuple[str, ...] = ()
     shares: np.ndarray | None = None
     pieces: bool = False
     cut_up: bool = False
+
+    def over(self, schedule: Schedule, shares: np.ndarray | None = None, cut_up: bool = False) -> Prepared:
+        """Return the same for another schedule with the same inputs; what does not depend on a schedule is shared."""
+        for name in STEADY:
+            getattr(self, name)
+        result = object.__new__(Prepared)
+        known = vars(self)
+        vars(result).update({name: known[name] for name in FIELDS}, schedule=schedule, shares=shares, cut_up=cut_up)
+        return result
+
+    @cached_property
+    def lengths(self) -> np.ndarray:
+        """The lengths (K,) of the intervals."""
+        return self.schedule.lengths
+
+    @cached_property
+    def inside(self) -> np.ndarray:
+        """Which increments act inside their intervals (K, m)."""
+        return self.schedule.inside
+
+    @cached_property
+    def kernels(self) -> Kernels | None:
+        """The Gaussian kernels of intervals whose equation is linear-quadratic, None where there is none."""
+        if self.yau is None:
+            return None
+        inside = self.inside & (self.inside.all(axis=1, keepdims=True) if self.lie else True)
+        return self.yau.kernels(self.schedule.starts, self.lengths, inside, self.theta, self.lie, self.origin, self.series)
+
+    @cached_property
+    def notes(self) -> tuple[str, ...]:
+        """What is to be said of the schedule."""
+        return (OMITTED,) if self.system.cross is not None and (self.schedule.seen & ~self.inside).any() else ()
 
     @cached_property
     def grid_cache(self) -> GridCache:
@@ -275,6 +304,11 @@ class Prepared:
         return result[0]
 
 
+# What of a `Prepared` does not depend on its schedule: what is computed, and with it the fields.
+STEADY = ("divides", "gaussian", "timed", "weak", "mixed", "cut", "limits")
+FIELDS = (*(field.name for field in fields(Prepared)), *STEADY)
+
+
 def coefficients_of(prepared: Prepared) -> Coefficients:
     """Return what the loop needs of the coefficients in time of all intervals."""
     schedule, system, theta = prepared.schedule, prepared.system, prepared.theta
@@ -282,7 +316,7 @@ def coefficients_of(prepared: Prepared) -> Coefficients:
     starts, lengths, stops = schedule.starts[:, None], prepared.lengths[:, None], schedule.stops[:, None]
     resolved = system.resolved and not prepared.mixed
     if prepared.timed:
-        nodes = np.clip(starts + lengths * GAUSS_NODES, starts, np.nextafter(stops, starts))
+        nodes = within(starts + lengths * GAUSS_NODES, starts, stops)
         t = np.concatenate([nodes, stops] if resolved else [nodes, stops, probed(starts, stops)], axis=1)
     else:
         t = np.concatenate([np.full((count, 1), prepared.model.start), stops], axis=1)
@@ -318,11 +352,14 @@ def coefficients_of(prepared: Prepared) -> Coefficients:
     G = np.zeros(t.shape)
     if prepared.divides:
         G = everywhere(system.covariance, "G" if system.steady_covariance else None)[..., 0, 0]
-    noise = everywhere(system.noise, "S" if system.steady_noise else None)
+
+    def noise() -> np.ndarray:
+        return everywhere(system.noise, "S" if system.steady_noise else None)
+
     if count == 1 and system.steady_noise:  # one interval of an online filter
-        precisions, constants = prepared.once(Derived.ONE_PRECISION, seen.tobytes(), lambda: precision(noise[:, ends]))
+        precisions, constants = prepared.once(Derived.ONE_PRECISION, seen.tobytes(), lambda: precision(noise()[:, ends]))
     else:
-        precisions, constants = precision(noise[:, ends])
+        precisions, constants = precision(noise()[:, ends])
     parts = np.ones(count, int)
     if resolved and prepared.timed:
         parts = np.isfinite(factors).all(axis=(1, 2)).astype(int)
@@ -332,7 +369,7 @@ def coefficients_of(prepared: Prepared) -> Coefficients:
         if not system.steady_covariance:
             parts = np.maximum(parts, parts_needed(G[:, probes, None], G[:, own, None]))
         if not (system.samples or system.steady_noise):
-            parts = np.maximum(parts, parts_needed(precision(noise[:, probes])[0], precisions))
+            parts = np.maximum(parts, parts_needed(precision(noise()[:, probes])[0], precisions))
     drifts, outputs, covariances = (np.array(part, order="C") for part in (factors[:, own], factors[:, ends], G[:, own]))
     return Coefficients(drifts, outputs, covariances, precisions, constants, parts)
 
@@ -355,37 +392,40 @@ def _mixed_terms(prepared: Prepared, t: np.ndarray) -> np.ndarray:
 def kinds_of(prepared: Prepared) -> np.ndarray:
     """Return how the compiled loop of `line/loop.py` takes each interval (K,), -1 where it does not."""
     system, schedule, yau, kernels = prepared.system, prepared.schedule, prepared.yau, prepared.kernels
-    positive = prepared.lengths > 0
     none = np.full(len(schedule), -1)
     if not len(schedule) or np.iscomplexobj(prepared.theta) or prepared.lie or (prepared.model.periodic and not system.samples):
         return none
-    silent = ~schedule.seen.any(axis=1)
-    regular = positive & np.all(schedule.seen == prepared.inside, axis=1)
+    positive = prepared.lengths > 0
     if not prepared.gaussian:
         usable = system.samples and not system.moving and system.separated is not None
         return np.where(positive, FACTOR, -1) if usable else none
     if system.separated is None and not prepared.mixed:
         return none
-    whole = np.zeros(len(schedule), bool)
-    if kernels is not None and yau is not None and yau.unobserved and yau.steady_gauge:
-        whole = positive & (kernels.place >= 0) & (kernels.errors[kernels.place] == 0)
-    split = positive & prepared.divides & (prepared.coefficients.parts == 1)
+    # Increments act inside of just their intervals, or not at all.
+    regular, affine = system.samples or np.all(schedule.seen == prepared.inside, axis=1), yau is not None and yau.affine
+    result = none
+    if prepared.divides and (system.samples or not affine):
+        split = positive & (prepared.coefficients.parts == 1) & regular
+        result = np.where(split, SPLIT_FACTOR if system.samples else SPLIT, -1)
+    if kernels is None or yau is None or not (yau.unobserved and yau.steady_gauge):
+        return result
+    whole = positive & (kernels.place >= 0) & (kernels.errors[kernels.place] == 0)
+    silent = ~schedule.seen.any(axis=1)
     if system.samples:
-        whole = whole & (silent | (not system.general))
-        return np.where(whole, FACTOR, np.where(split, SPLIT_FACTOR, -1))
-    inside = np.where(whole, KERNEL, -1) if yau is not None and yau.affine else np.where(split, SPLIT, -1)
-    return np.where(silent, np.where(whole, FACTOR, inside), np.where(regular, inside, -1))
+        return np.where(whole & (silent | (not system.general)), FACTOR, result)
+    return np.where(whole & silent, FACTOR, np.where(whole & regular & affine, KERNEL, result))
 
 
 def steps_of(prepared: Prepared) -> Steps:
     """Return what the compiled loop reads of all intervals."""
     kinds, kernels, c = prepared.kinds, prepared.kernels, prepared.coefficients
     inputs = 1 + prepared.system.m
-    parameters = np.full((len(kinds), kernel_size(inputs)), np.nan)
-    here = np.flatnonzero((kinds == KERNEL) | (kinds == FACTOR))
-    if prepared.gaussian and kernels is not None and len(here):
-        parameters[here] = packed(kernels.transitions, kernels.place[here])
-    precisions = np.where((kinds == KERNEL)[:, None, None, None], 0.0, c.precisions)
+    parameters, precisions = np.full((len(kinds), kernel_size(inputs)), np.nan), c.precisions
+    if prepared.gaussian and kernels is not None:
+        here = np.flatnonzero((kinds == KERNEL) | (kinds == FACTOR))
+        if len(here):
+            parameters[here] = packed(kernels.transitions, kernels.place[here])
+        precisions = np.where((kinds == KERNEL)[:, None, None, None], 0.0, precisions)
     lengths = np.ascontiguousarray(prepared.lengths)
     shares = np.ones(len(kinds)) if prepared.shares is None else prepared.shares
     return Steps(kinds, lengths, shares, precisions, c.constants, parameters, c.drifts, c.outputs, c.covariances)
@@ -431,10 +471,10 @@ def parts_of(prepared: Prepared) -> Parts | None:
         return None
     result, owner = prepared, np.arange(len(prepared.schedule))
     for _ in range(ROUNDS):
-        schedule = result.schedule
-        needed = np.where(result.lengths > 0, result.coefficients.parts, 1)
-        if not (needed > 1).any():
+        schedule, needed = result.schedule, result.coefficients.parts
+        if not ((needed > 1) & (result.lengths > 0)).any():
             break
+        needed = np.where(result.lengths > 0, needed, 1)
         bounds = [_bounds(result, k, n) if n > 1 else [schedule.starts[k]] for k, n in enumerate(needed)]
         counts = np.array([len(bound) for bound in bounds])
         starts = np.concatenate(bounds)
@@ -448,13 +488,13 @@ def parts_of(prepared: Prepared) -> Parts | None:
         seen = schedule.seen[parent] & (inside | last[:, None])
         elapsed = np.where(inside, whole, np.where(seen, schedule.elapsed[parent], 0.0))
         schedule = Schedule(starts, stops, seen, elapsed, schedule.inputs)
-        result = replace(result, schedule=schedule, lengths=schedule.lengths, inside=schedule.inside)
+        result = result.over(schedule)
         owner = owner[parent]
     if result is prepared:
         return None
     first = np.searchsorted(owner, np.arange(len(prepared.schedule) + 1))
     shares = np.where(result.lengths < prepared.lengths[owner], result.lengths / prepared.lengths[owner], 1.0)
-    return Parts(replace(result, shares=shares), first)
+    return Parts(result.over(result.schedule, shares), first)
 
 
 def parts_of_step(prepared: Prepared, k: int, values: np.ndarray, window: Window) -> Parts | None:
@@ -486,8 +526,7 @@ def parts_of_step(prepared: Prepared, k: int, values: np.ndarray, window: Window
     starts, stops = np.array([*bounds, stop]), np.array([*bounds[1:], stop, stop])
     result = Schedule(starts, stops, seen, np.where(seen, schedule.elapsed[k], 0.0), schedule.inputs)
     shares = np.append(result.lengths[:-1] / length, 1.0)
-    own = replace(prepared, schedule=result, lengths=result.lengths, inside=result.inside, shares=shares, cut_up=True)
-    return Parts(own, np.array([0, count]))
+    return Parts(prepared.over(result, shares, True), np.array([0, count]))
 
 
 def _bounds(prepared: Prepared, k: int, count: int) -> list[Any]:

@@ -59,6 +59,8 @@ class YauLine(YauSystem):
 
         With `series` they are computed by power series, which have no inputs: rates of observation do not act inside.
         """
+        if not (self.unobserved or lie):
+            return None
         served = np.array([self.serves(row, lie) and (series is None or lie or not row.any()) for row in inside], bool)
         rows, at, none = np.flatnonzero(served & (lengths > 0)), np.array([origin]), np.zeros(self.m, bool)
         if not len(rows):
