@@ -20,10 +20,10 @@ class Control(NamedTuple):
     """What decides the next step beside the particles.
 
     `interval` counts intervals; `substeps` with `stages`, whose `error` was measured in an interval of this `length`,
-    and is `trusted` in so many more, for `streak` of them last time; `narrow` the ratio of the deviations after and before the last observation,
-    `variance` of a mean times N, `losses` the sum of these and `work` that of steps and moves, `since` counts steps after the
-    last move and `floor` is what that has left, `doubtful_until` the number of resamplings until which standard errors are lower bounds, and `shifted` the
-    variance of the log-likelihood by the time step.
+    and is `trusted` in so many more, for `streak` of them last time; `narrow` the ratio of the deviations after and before the
+    last observation, `variance` of a mean times N, `losses` the sum of these and `work` that of steps and moves, `since` counts
+    steps after the last move and `floor` is what that has left, `doubtful_until` the number of resamplings until which standard
+    errors are lower bounds, and `shifted` the variance of the log-likelihood by the time step.
     """
 
     interval: int

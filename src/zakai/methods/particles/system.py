@@ -217,7 +217,7 @@ def root(Q: Array) -> Array:
 
 
 def roots(Q: Array) -> Array:
-    """Return columns R (J, n, d) with R R' = Q for matrices (J, n, n), of which the last ones are zero where Q has null directions.
+    """Return columns R (J, n, d) with R R' = Q for matrices (J, n, n); the last ones are zero where Q has null directions.
 
     The matrices are scaled to a unit diagonal first, so that a coordinate with little noise keeps it.
     """
