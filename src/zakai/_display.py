@@ -22,6 +22,13 @@ def number(value: float) -> str:
     return f"{float(value):.6g}"
 
 
+def rough(value: float) -> str:
+    """Return a number in one or two digits, as in 0.03, 5,600 or 3e+06."""
+    if not 0.0 < abs(value) < 1e5:
+        return f"{value:.0e}"
+    return f"{float(f'{value:.2g}'):,.12g}"
+
+
 def counted(count: int, noun: str) -> str:
     """Return a count with its noun, in the plural where needed."""
     return f"{count:,} {noun}" + ("" if count == 1 else "s")

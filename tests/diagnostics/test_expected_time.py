@@ -14,7 +14,7 @@ import zakai
 from zakai.diagnostics import expected_time
 from zakai.diagnostics.expected_time import Expected, expected_seconds
 from zakai.errors import ZakaiError
-from zakai.numerics.compiled import kernel
+from zakai.numerics.compiled import compilation_time, kernel
 
 PENDULUM = zakai.load_model("gallery:pendulum")
 
@@ -78,6 +78,17 @@ def test_a_kernel_that_is_compiled_is_completed():
         compiled(1.0)
         time.sleep(2.0)
     assert len(compiled.signatures) == 1 and gc.isenabled()
+
+
+def test_the_time_in_which_kernels_are_compiled_does_not_end_the_measurement():
+    names: dict[str, Any] = {"np": np}
+    exec("def inner(x):\n    y = x\n" + 60 * "    y += np.sin(y) / (3.0 + y * y)\n" + "    return y\n", names)
+    compiled: Any = kernel(float64(float64))(names["inner"])
+    before = compilation_time()
+    with expected_time._at_most(0.05):
+        assert np.isfinite(compiled(1.0))
+        assert compilation_time() - before > 0.05
+        time.sleep(0.02)
 
 
 def test_blocks_add_their_times_and_the_record_is_not_filtered_as_a_whole(monkeypatch):

@@ -10,7 +10,8 @@ import sympy as sp
 from zakai import _display
 from zakai.algebra._readable import readable
 from zakai.algebra.conditions import Condition, all_hold
-from zakai.algebra.theorems import NOT_HANDLED, conditions_of, in_order
+from zakai.algebra.order import in_order
+from zakai.algebra.theorems import NOT_HANDLED, conditions_of
 from zakai.errors import ZakaiError
 from zakai.models.features import DOMAIN, STATE_DEPENDENT_DIFFUSION
 from zakai.models.model import Model

@@ -10,7 +10,8 @@ from typing import Any
 from zakai.algebra.advice import nearest, what_to_do
 from zakai.algebra.conditions import Condition, all_hold
 from zakai.algebra.independent import IndependentBlock, independent_blocks
-from zakai.algebra.theorems import PARTICLES_FROM, WORK, conditions_of, in_order
+from zakai.algebra.order import GENERAL, in_order, work_in_words
+from zakai.algebra.theorems import conditions_of
 from zakai.errors import ConditionError
 from zakai.models.model import Model
 from zakai.models.prior import GaussianPrior
@@ -49,8 +50,10 @@ class Division:
         return f"the system falls into {len(self.blocks)} independent blocks, and {how}: {named}"
 
 
-def chosen(model: Model, method: str) -> tuple[str, str, Mapping[str, Conditions]]:
+def chosen(model: Model, method: str, tolerance: float | None = None) -> tuple[str, str, Mapping[str, Conditions]]:
     """Return the method of that name, or for "auto" the first that holds; the reason; and all conditions that were checked.
+
+    `tolerance` is the accuracy that is asked of "auto", None for those of the methods themselves.
 
     Raises:
         ConditionError: the method does not hold, or none does; the message names the assumption that fails.
@@ -62,10 +65,10 @@ def chosen(model: Model, method: str) -> tuple[str, str, Mapping[str, Conditions
             raise ConditionError(f"{model.source}: {method} does not hold: {failure(conditions)}\n{advice}")
         return method, "asked for by name, and every assumption of its theorem holds", {method: conditions}
     considered: dict[str, Conditions] = {}
-    for name in in_order(model):
+    for name in in_order(model, tolerance):
         considered[name] = conditions_of(name, model)
         if all_hold(considered[name]) is True:
-            return name, _reason(name, model), considered
+            return name, _reason(name, model, tolerance), considered
     name = nearest(considered)
     reason = failure(considered[name])
     raise ConditionError(
@@ -73,20 +76,23 @@ def chosen(model: Model, method: str) -> tuple[str, str, Mapping[str, Conditions
     )
 
 
-def _reason(name: str, model: Model) -> str:
+def _reason(name: str, model: Model, tolerance: float | None) -> str:
     """Return why "auto" takes a method."""
-    if name != "guided-particles":
+    if name not in GENERAL or model.n == 1:
         return "the first method whose every assumption holds for this system"
-    work = ", ".join(f"about {work(model.n):.1g} for {other}" for other, work in WORK.items())
-    return (
-        f"particles, which hold for any model: no exact method holds, and with {model.n} states they need the least work for "
-        f"their accuracy (evaluations for an observation: {work})"
-        if model.n >= PARTICLES_FROM
-        else "particles, which hold for any model: no other method holds for this system"
-    )
+    reason = "particles, which hold for any model: no other method that auto tries holds for this system"
+    if all_hold(conditions_of("yau-yau", model)) is True:
+        reason = (
+            "no exact method holds, and of the methods for any system it needs the least time for its accuracy, or is more exact "
+            f"and needs little more (expected for an observation: {work_in_words(model, tolerance)})"
+        )
+    named = name == "guided-particles" and all_hold(conditions_of("tensor-train", model)) is True
+    return f"{reason}; tensor-train by name gives the whole density, more exactly" if named else reason
 
 
-def divided(model: Model, prior: Any, method: str = "auto", by_value: bool = True) -> Division | None:
+def divided(
+    model: Model, prior: Any, method: str = "auto", by_value: bool = True, tolerance: float | None = None
+) -> Division | None:
     """The blocks of a system with their methods, or None where it is better filtered as a whole.
 
     "auto" takes blocks wherever there are several, but for linear systems of at most `FEW` states with a Gaussian prior; a
@@ -106,7 +112,7 @@ def divided(model: Model, prior: Any, method: str = "auto", by_value: bool = Tru
     methods, conditions = {}, {}
     for part in dict.fromkeys(block.model for block in blocks):
         try:
-            methods[part], _, conditions[part] = chosen(part, method)
+            methods[part], _, conditions[part] = chosen(part, method, tolerance)
         except ConditionError as error:
             if method == "auto" or model.n > MANY:
                 raise

@@ -246,42 +246,7 @@ def theorem_of(name: str) -> Callable[[Model], tuple[Condition, ...]]:
     return THEOREMS[name] if name in THEOREMS else PEERS[name]
 
 
-PARTICLES_FROM = 4  # states, from which particles are expected to need less work than a grid
-# Points at which a method evaluates the formulas for an observation, by the number of states n: a grid has some 25 in each
-# direction, and particles are 5,600 for their default tolerance, moved and weighed some ten times.
-WORK: Mapping[str, Callable[[int], float]] = {"yau-yau": lambda n: 25.0**n, "guided-particles": lambda n: 5.6e4}
 NOT_HANDLED = "what this method handles"  # the source of a condition about a feature
-
-
-def in_order(model: Model) -> tuple[str, ...]:
-    """Return the methods that "auto" tries for a model, in order.
-
-    With a nonlinear h, or a sample with a law of its own, a Gaussian sum is less accurate than a density on a grid, which takes
-    up to four states; with four and a sample of a known h it is taken first, as it is faster.  "limited-direct" needs many times
-    the work of "yau-yau" with three states, and for increments of an h with a kink in several; in two its grid does not hold the
-    narrow peaks and rings that precise samples of a nonlinear h leave.
-
-    Particles are the last resort.  With four or more states and a nonlinear h, or a law of its own, of two or more of them, they
-    are taken before a grid and a Gaussian sum, whose work grows with a power of these numbers: see `WORK`.  With four or more
-    states they are always taken before a grid.
-    """
-    last: tuple[str, ...] = ()
-    nonlinear, samples = affine_observation(model) is None, model.observation_kind == "samples"
-    laws = features.OF_OBSERVATION & model.features.keys()
-    if model.features.keys() - {features.OBSERVED_ANGLES} or (model.n < 4 and nonlinear):
-        last = ("general-direct",)
-    kinks = not samples and model.observation.has(sp.Abs, sp.sign)
-    if model.n == 3 or (model.n > 1 and kinks) or (model.n == 2 and samples and (nonlinear or laws)):
-        last = ("limited-direct", "general-direct")
-    if features.OBSERVED_ANGLES in model.features:
-        last = (*last, "kalman-bucy")  # it takes the nearest image alone
-    law = [*model.observation, *model.observation_noise.diagonal(), *model.family_parameters.values()]
-    read = set().union(*(part.free_symbols for part in [*law, *([] if model.log_density is None else [model.log_density])]))
-    if model.n >= PARTICLES_FROM and (nonlinear or laws) and len(read & set(model.x)) > 1:
-        last = ("guided-particles", "general-direct", "yau-yau", *last[len(last) - last.count("kalman-bucy") :])
-    else:
-        last = (*last, "guided-particles", *(["yau-yau"] if model.n >= PARTICLES_FROM else []))
-    return (*(name for name in _registry.AUTO if name not in last), *last)
 
 
 def conditions_of(name: str, model: Model) -> tuple[Condition, ...]:

@@ -52,7 +52,8 @@ def expected_seconds(model: Model, record: Record, method: str = "auto", *, most
         model: the system, with a prior.
         record: K observations of the model's kind.
         method: a method's name, or "auto".
-        most: seconds after which the measurement ends. In the main thread it ends within a step, elsewhere after one.
+        most: seconds after which the measurement ends, without those of compilation. In the main thread it ends within a step,
+            elsewhere after one.
         **options: options of the method.
 
     Returns:
@@ -154,16 +155,19 @@ def _preparation(setting: Setting, schedule: Schedule) -> tuple[float, float]:
 def _at_most(seconds: float) -> Iterator[None]:
     """Raise _LateError after some seconds, in the main thread of a system with interval timers; never elsewhere.
 
-    A kernel that is then compiled is completed first.
+    The compilation of kernels does not count, and a kernel that is being compiled at that time is completed first.
     """
     timers = hasattr(signal, "setitimer") and threading.current_thread() is threading.main_thread()
     if not timers or signal.getitimer(signal.ITIMER_REAL)[0] > 0.0:
         yield
         return
 
+    ends = working_time() + seconds
+
     def late(*_: Any) -> None:
-        if compiling():
-            signal.setitimer(signal.ITIMER_REAL, AGAIN)
+        left = ends - working_time()
+        if compiling() or left > 0.0:
+            signal.setitimer(signal.ITIMER_REAL, max(left, AGAIN))
             return
         raise _LateError(f"more than {seconds:g} s")
 

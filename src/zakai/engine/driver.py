@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import nullcontext
 from typing import Any, overload
 
@@ -13,6 +13,7 @@ from zakai.engine.batch import Progress, filter_all
 from zakai.engine.loop import KEPT_BYTES
 from zakai.engine.plan import Plan, plan_of
 from zakai.engine.results import FilterResult
+from zakai.engine.setting import Setting
 from zakai.errors import InputError
 from zakai.models._errors import named
 from zakai.models.checks import check_noise_at, check_noise_within
@@ -142,13 +143,20 @@ def filter_planned(
     return results
 
 
-def planned(model: Model, prior: Any, method: str, options: Mapping[str, Any], by_value: bool = True) -> Plan:
-    """Return how a system is filtered from a prior; None stands for the model's own."""
+def planned(
+    model: Model,
+    prior: Any,
+    method: str,
+    options: Mapping[str, Any],
+    by_value: bool = True,
+    unfit: Callable[[Setting], str] | None = None,
+) -> Plan:
+    """Return how a system is filtered from a prior; None stands for the model's own, and `unfit` is that of `plan_of`."""
     if prior is not None:
         check_prior(model, prior)
     decided: set[bool] = kept(model, (planned, str(method)), set)  # once made, a decision needs no thread
     with nullcontext() if decided else announced(f"{model.source}: deciding which method holds"):
-        plan = plan_of(model, model.prior if prior is None else prior, method, options, by_value)
+        plan = plan_of(model, model.prior if prior is None else prior, method, options, by_value, unfit)
     decided.add(True)
     return plan
 

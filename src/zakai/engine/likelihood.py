@@ -74,6 +74,11 @@ def log_likelihood(
     return LogLikelihood(model, with_inputs(record, inputs), method, chosen_parameters(model, parameters), options)
 
 
+def _without_gradient(setting: Setting) -> str:
+    """Return why "auto" does not take a method for a gradient, or nothing."""
+    return "" if setting.method.differentiable else "has no gradient with respect to parameters"
+
+
 def _jump_of(model: Model, names: tuple[str, ...]) -> str:
     """Return that the place of a jump depends on one of the parameters, or nothing."""
     chosen = {symbol for symbol in model.parameter_symbols if symbol.name in names}
@@ -112,7 +117,7 @@ class LogLikelihood:
 
     def __init__(self, model: Model, record: Record, method: str, names: tuple[str, ...], options: dict[str, Any]):
         (record,) = check_records(model, record)
-        plan = planned(model, None, method, options, by_value=False)
+        plan = planned(model, None, method, options, by_value=False, unfit=_without_gradient)
         check_noise([plan], [record])
         for setting in plan.settings:
             if not setting.method.differentiable:

@@ -12,7 +12,8 @@ from zakai import _registry
 from zakai.algebra.choice import Conditions, Division, chosen, divided
 from zakai.algebra.conditions import all_hold
 from zakai.algebra.independent import IndependentBlock
-from zakai.algebra.theorems import conditions_of, in_order
+from zakai.algebra.order import in_order
+from zakai.algebra.theorems import conditions_of
 from zakai.engine.blocks import joined_blocks, record_of_block
 from zakai.engine.loop import KEPT_BYTES, Run
 from zakai.engine.results import FilterResult
@@ -92,7 +93,7 @@ def plan_of(
     """
     if method != "auto":
         _registry.load(method)  # an unknown name is refused before anything is computed
-    division = divided(model, prior, method, by_value)
+    division = divided(model, prior, method, by_value, tolerance_asked(options))
     if division is None:
         return _plan_of_whole(model, prior, method, options, unfit)._replace(request=(method, options))
     if unfit is not None and method == "auto":
@@ -106,6 +107,13 @@ def plan_of(
     return Plan(model, division.blocks, settings, division.why, {}, division, (method, options))
 
 
+def tolerance_asked(options: Mapping[str, Any]) -> float | None:
+    """Return the option `tolerance` where it is a positive number, else None: the method itself checks it."""
+    given = options.get("tolerance")
+    number = isinstance(given, int | float) and not isinstance(given, bool) and given > 0
+    return float(given) if number else None  # type: ignore[arg-type]
+
+
 _LAST = "guided-particles"  # which keeps a prior no better than a grid does
 
 
@@ -116,13 +124,14 @@ def _plan_of_whole(
 
     "auto" goes on to the next one that holds where a method is unfit, or loses the density at the prior.
     """
-    name, why, considered = chosen(model, method)
+    tolerance = tolerance_asked(options)
+    name, why, considered = chosen(model, method, tolerance)
     lost: list[str] = []
     while True:
         loaded = _registry.load(name)
         setting = Setting.of(model, prior, loaded, _own_options([loaded], options)[0])
         exact = name == "kalman-bucy" and isinstance(prior, GaussianPrior)
-        order = in_order(model)
+        order = in_order(model, tolerance)
         later = order[order.index(name) + 1 :] if method == "auto" and not exact else ()
         others = [one for one in later if all_hold(conditions_of(one, model)) is True]
         fault = unfit(setting) if unfit and others else ""

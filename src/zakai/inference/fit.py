@@ -171,7 +171,10 @@ def fit(
     values = _start(model, names, start)
     box = _box(model, names, values, bounds)
     now = model.with_parameters(**dict(zip(names, values.tolist(), strict=True)))
-    methods = [setting.method for setting in planned(now, None, method, options, by_value=False).settings]
+    plan = planned(now, None, method, options, by_value=False)
+    methods = [setting.method for setting in plan.settings]
+    if plan.division is None:
+        method = plan.method  # the choice of "auto" may depend on the parameters
     if any(one.random or one.by_values for one in methods):
         random = any(one.random for one in methods)
         return _fit_by_values(now, record, names, values, box, method, options if random else {**options, "seed": None})

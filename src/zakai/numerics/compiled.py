@@ -40,12 +40,14 @@ class _Compilation:
     """
 
     def __init__(self) -> None:
-        self.depth, self.before, self.since, self.collects = 0, 0.0, 0.0, False
+        self.depth, self.collects = 0, False
+        # The seconds of earlier compilations, and when the present one began: one object, which other threads read as a whole.
+        self.clock: tuple[float, float | None] = (0.0, None)
         self.announced, self.timer = False, Timer(0.0, _announce)
 
     def __enter__(self) -> None:
         if self.depth == 0:
-            self.since, self.collects = time.monotonic(), gc.isenabled()
+            self.clock, self.collects = (self.clock[0], time.monotonic()), gc.isenabled()
             gc.disable()
             if not self.announced and shown():
                 self.timer = Timer(LONG, self._announce)
@@ -61,13 +63,14 @@ class _Compilation:
         self.depth -= 1
         if self.depth == 0:
             self.timer.cancel()
-            self.before += time.monotonic() - self.since
+            self.clock = (self.seconds(), None)
             if self.collects:
                 gc.enable()
 
     def seconds(self) -> float:
         """Return the seconds until now."""
-        return self.before + (time.monotonic() - self.since if self.depth else 0.0)
+        before, since = self.clock
+        return before if since is None else before + (time.monotonic() - since)
 
 
 def _announce() -> None:
