@@ -187,3 +187,15 @@ def test_a_simulated_file_has_the_names_of_the_observations_and_is_read_by_them(
     made, other = (package.read_record(tmp_path / name, model) for name in ("made.csv", "swapped.csv"))
     assert np.allclose(made.values, package.simulate(model, 0.1 * np.arange(1, 6), seed=0)[1].values, rtol=1e-12)
     assert np.array_equal(made.values, other.values) and not made._note and not other._note
+
+
+def test_columns_that_go_by_position_are_named_before_the_record_is_filtered(zakai, tmp_path):
+    prior = '[prior]\nkind = "gaussian"\nmean = [0, 0]\ncov = [1, 1]\n'
+    (tmp_path / "plane.toml").write_text(f'state = ["x", "y"]\ndrift = ["-x", "-y"]\nobservation = ["x", "y"]\n{prior}')
+    (tmp_path / "named.csv").write_text("time,radar,lidar\n0.1,0.2,0.1\n0.2,0.1,0.3\n")
+    refused = zakai("filter", "plane.toml", "named.csv", "-o", "r.nc", "--option", "order=2")
+    first, last = refused.err.splitlines()
+    assert first.startswith("warning: the columns radar, lidar of the record are taken by their position")
+    assert refused.code == 2 and last.startswith("error: ")
+    answer = zakai("filter", "plane.toml", "named.csv", "-o", "r.nc")
+    assert answer.code == 0 and answer.err.count("by their position") == 1

@@ -15,7 +15,7 @@ import sympy as sp
 from zakai import _display
 from zakai.algebra import _json, _page
 from zakai.algebra.blocks import Block, blocks
-from zakai.algebra.choice import Division, divided, recommended
+from zakai.algebra.choice import Division, chosen, divided, recommended
 from zakai.algebra.conditionally_linear import ConditionallyLinear, conditionally_linear
 from zakai.algebra.conditions import Condition, all_hold
 from zakai.algebra.estimation_algebra import EstimationAlgebra, estimation_algebra
@@ -97,6 +97,13 @@ class Analysis:
     def division(self) -> Division | None:
         """The independent blocks, given the prior, and the method that "auto" takes for each; None where it takes one for all."""
         return None if self.recommended is None else divided(self.model, self.model.prior)
+
+    @property
+    def why(self) -> str:
+        """On what grounds "auto" takes the method or the blocks; nothing where it takes none."""
+        if self.recommended is None:
+            return ""
+        return chosen(self.model, "auto")[1] if self.division is None else self.division.why
 
     @cached_property
     def explosion(self) -> Explosion | None:

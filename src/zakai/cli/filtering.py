@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import textwrap
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
     from zakai.engine.results import FilterResult
     from zakai.models.model import Model
 
+_WIDTH = 110  # columns of a terminal
 _SHOWN = 20  # states whose last estimates are printed
 
 
@@ -61,7 +63,7 @@ def filter(
             # Only the report and quantiles use the densities.
             kept = report is not None or (len(record) + 1) * model.n <= MOST_QUANTILES
             result = run(model, record, method, keep=None if kept else "moments", progress=advance, **options)
-    _warn(result.warnings)
+    _warn(_but_note(result.warnings, record))
     result.save(output)
     if report is not None:
         write_report(result, report, truth=truth)
@@ -98,7 +100,7 @@ def forecast(
     with progress("filtering") as advance:
         result = run(model, record, method, keep="moments", progress=advance, **options)
     found = result.forecast(times)
-    _warn(dict.fromkeys([*result.warnings, *found.warnings]))
+    _warn(_but_note(dict.fromkeys([*result.warnings, *found.warnings]), record))
     found.save(output)
     _summarise(found, [("forecast times", f"{len(times):,}, {times[0]:.12g} to {times[-1]:.12g}")], (-1, "end"), [output])
 
@@ -123,7 +125,7 @@ def fit(
     model, record, options = _given(source, record_path, settings, inputs_path, unit, origin, columns)
     names = [name.strip() for name in parameters.split(",") if name.strip()] or None
     found = run(model, record, names, method, **options)
-    _warn(found.warnings)
+    _warn(_but_note(found.warnings, record))
     if output is not None:
         with atomic_write(output) as temporary:
             temporary.write_text(found.model.text, encoding="utf-8")
@@ -144,7 +146,9 @@ def _given(
     """Read the model, the record with its inputs, and the options."""
     options = options_of(settings)
     model = load_model(source)
-    return model, record_with_inputs(path, model, inputs_path, unit, origin, columns), options
+    record = record_with_inputs(path, model, inputs_path, unit, origin, columns)
+    _warn([record._note] if record._note else [])  # before a long run
+    return model, record, options
 
 
 def record_with_inputs(
@@ -162,6 +166,11 @@ def record_with_inputs(
     inputs = read_inputs(inputs_path, model, record.clock)
     inputs.check(model, float(record.times[0]), float(record.times[-1]), name=shown(inputs_path))
     return record.with_inputs(inputs)
+
+
+def _but_note(warnings: Iterable[str], record: Record) -> list[str]:
+    """Return the warnings without that about the columns of the record, which has been printed."""
+    return [warning for warning in warnings if warning != record._note]
 
 
 def _warn(warnings: Iterable[str]) -> None:
@@ -182,7 +191,9 @@ def _summarise(
     table += [("written", str(path)) for path in written if path is not None]
     width = max(len(name) for name, _ in table)
     for name, text in table:
-        print(f"{name:<{width}}  {text}")
+        indent = " " * (width + 2)
+        wrapped = textwrap.fill(text, _WIDTH, subsequent_indent=indent, break_on_hyphens=False) if name == "method" else text
+        print(f"{name:<{width}}  {wrapped}")
 
 
 def options_of(settings: list[str]) -> dict[str, Any]:

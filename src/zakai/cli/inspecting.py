@@ -66,8 +66,8 @@ def methods(source: str | None, given: RecordFile | None = None) -> None:
         rows.append((name, words))
     _columns(rows)
     print(f"\nauto takes: {analysis.recommended or 'none, for none that it tries holds'}")
-    if analysis.division is not None:
-        print(textwrap.fill(analysis.division.why, 110, break_on_hyphens=False))
+    if analysis.why:
+        print(textwrap.fill(analysis.why, 110, break_on_hyphens=False))
 
 
 def _split(model: Model) -> str:
