@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import zakai
-from zakai.algebra.choice import chosen
+from zakai.algebra.choice import chosen, faster
 
 PARTICLES = "guided-particles"
 RE_ENTRY = {
@@ -119,3 +119,10 @@ def test_the_expected_number_of_particles_is_that_of_the_method():
     result = zakai.filter(model, zakai.Record([0.1], [[np.nan]], "samples"), PARTICLES, tolerance=0.05, keep="moments")
     count = int(result.health["particles"][1])
     assert f"{float(f'{count:.2g}'):,.0f} particles" in str(expected_work(PARTICLES, model, 0.05))
+
+
+def test_a_faster_method_is_named_where_a_third_of_the_time_is_expected():
+    assert faster(ring(0.01), "yau-yau", 1.0) == PARTICLES
+    assert faster(ring(0.01), "yau-yau", 0.1) is None and faster(ring(0.01), PARTICLES, 0.1) == "yau-yau"
+    assert faster(ring(1e-8), PARTICLES, 10.0) is None  # a grid would not hold it
+    assert faster(zakai.load_model("gallery:cubic-sensor"), "yau-yau", 10.0) is None

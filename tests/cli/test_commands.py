@@ -190,7 +190,7 @@ def test_a_simulated_file_has_the_names_of_the_observations_and_is_read_by_them(
 
 
 def test_columns_that_go_by_position_are_named_before_the_record_is_filtered(zakai, tmp_path):
-    prior = '[prior]\nkind = "gaussian"\nmean = [0, 0]\ncov = [1, 1]\n'
+    prior = 'observation_kind = "increments"\n[prior]\nkind = "gaussian"\nmean = [0, 0]\ncov = [1, 1]\n'
     (tmp_path / "plane.toml").write_text(f'state = ["x", "y"]\ndrift = ["-x", "-y"]\nobservation = ["x", "y"]\n{prior}')
     (tmp_path / "named.csv").write_text("time,radar,lidar\n0.1,0.2,0.1\n0.2,0.1,0.3\n")
     refused = zakai("filter", "plane.toml", "named.csv", "-o", "r.nc", "--option", "order=2")

@@ -71,7 +71,7 @@ def test_a_first_observation_that_takes_long_is_announced(monkeypatch, caplog):
     model = zakai.load_model("gallery:pendulum")
     with caplog.at_level(logging.WARNING, "zakai"):
         zakai.filter(model, zakai.simulate(model, [0.5], seed=0)[1])
-    assert "the first observation takes more than 0 s; to shorten it" in caplog.text
+    assert "the first of 1 observations takes more than 0 s; to shorten it" in caplog.text
 
 
 def test_slow_steps_are_announced_within_a_segment_and_on_the_way_back(monkeypatch, caplog):
@@ -96,6 +96,29 @@ def test_what_takes_longer_than_was_announced_is_announced_again(monkeypatch, ca
     words = [one.getMessage() for one in caplog.records]
     assert len(words) == 2 and "927 more observations take about 232 s" in words[0]
     assert "543 more observations take about 4242 s" in words[1]
+
+
+def test_a_slow_observation_within_a_segment_is_announced_with_a_method_that_is_expected_to_be_faster(monkeypatch, caplog):
+    from zakai.algebra import expected_work
+    from zakai.methods.space import filter as space_filter
+
+    own, calls = space_filter.step, []
+
+    def step(*arguments):
+        calls.append(1)
+        sleep(0.4 if len(calls) == 9 else 0.0)
+        return own(*arguments)
+
+    monkeypatch.setattr(space_filter, "step", step)
+    monkeypatch.setattr(expected_work, "PARTICLE", 1e-9)
+    for name, value in (("FIRST", 0.0), ("EARLY", 1e9), ("LONG", 0.15), ("WATCHED", 0.02), ("MINUTE", 0.1)):
+        monkeypatch.setattr(batch, name, value)
+    model = zakai.load_model("gallery:pendulum")
+    _, record = zakai.simulate(model, 0.1 * np.arange(1, 11), seed=0)
+    with caplog.at_level(logging.WARNING, "zakai"):
+        zakai.filter(model, record, "yau-yau", keep="moments")
+    words = [one.getMessage() for one in caplog.records if "2 more observations take at least about" in one.getMessage()]
+    assert len(words) == 1 and "or take guided-particles, which holds too" in words[0]
 
 
 def test_a_decision_that_takes_long_is_announced(monkeypatch, caplog):

@@ -9,8 +9,9 @@ from typing import Any
 
 from zakai.algebra.advice import nearest, what_to_do
 from zakai.algebra.conditions import Condition, all_hold
+from zakai.algebra.expected_work import expected_work
 from zakai.algebra.independent import IndependentBlock, independent_blocks
-from zakai.algebra.order import GENERAL, in_order, work_in_words
+from zakai.algebra.order import AFFORDABLE, GENERAL, in_order, work_in_words
 from zakai.algebra.theorems import conditions_of
 from zakai.errors import ConditionError
 from zakai.models.model import Model
@@ -119,6 +120,16 @@ def divided(
             whole, first = failure(conditions_of(method, model)), str(error).splitlines()[0]
             raise ConditionError(f"{model.source}: {method} does not hold: {whole}; nor block by block: {first}") from None
     return Division(blocks, methods, conditions, method != "auto")
+
+
+def faster(model: Model, name: str, seconds: float) -> str | None:
+    """Return a method for any system that holds and is expected to need a third of `seconds` for an observation, or less."""
+    for other in GENERAL:
+        work = None if other == name else expected_work(other, model, None)
+        if work is not None and not work.fails and AFFORDABLE * work.seconds <= seconds:
+            if all_hold(conditions_of(other, model)) is True:
+                return other
+    return None
 
 
 def recommended(model: Model) -> str | None:

@@ -11,12 +11,15 @@ from threading import Event, Lock, Thread
 from typing import Any
 
 from zakai._progress import FIRST, bar
+from zakai.algebra.choice import faster
 from zakai.engine.loop import Run
 from zakai.numerics.compiled import working_time
 
 LONG = 10.0  # seconds of work that are announced
 EARLY, FEW = 1.5, 4  # seconds, and observations, after which work that takes twice as long is announced already
 OFF = 3.0  # times the announced seconds after which the rest is announced again
+MINUTE = 60.0  # seconds from which a method that is expected to be faster is named
+WATCHED = 1.0  # seconds between checks whether a run takes longer than was announced
 SURE = 0.5  # seconds after which the rest can be estimated
 
 _LOG = logging.getLogger("zakai")
@@ -60,6 +63,14 @@ def _watched(
         finished.set()
 
 
+def _advice(run: Run, each: float, left: float) -> str:
+    """Return what shortens a run of which an observation takes `each` seconds and the rest `left`."""
+    method, model = run.setting.method, run.setting.model
+    other = faster(model, method.name, each) if left > MINUTE else None
+    also = "" if other is None or other in method.shorter else f", or take {other}, which holds too and is expected to be faster"
+    return f"to shorten it, {method.shorter}{also}"
+
+
 class _Watch:
     """How much of all runs is done, and whether the rest takes long.
 
@@ -74,6 +85,7 @@ class _Watch:
         self.first = 0.0  # when the first observation was done, by the clock of `report_early`
         self.slow = 0  # successive measurements by which the rest takes long
         self.late = float("inf")  # when the rest has taken so much longer than was announced that it is announced again
+        self.seen = 0.0, 0  # when the last observation was seen to be done within a segment, and how many were
 
     def step(self, run: Run) -> None:
         """Add one observation within a segment that a run has begun."""
@@ -82,27 +94,52 @@ class _Watch:
             self.steps += 1
 
     def report_early(self, runs: Sequence[Run], finished: Event) -> None:
-        """Log after `FIRST` seconds how long runs take at least or about, if it is long and they were not announced before."""
+        """Log after `FIRST` seconds how long runs take, if it is long and they were not announced before; and again if longer."""
         began = working_time()
         while runs and working_time() - began < FIRST:
             if self.done + self.steps > 0 and not self.first:
                 self.first = working_time()
             if working_time() - began > EARLY and self.done + self.steps > FEW:
                 self._announce(runs[0], began, 2.0 * LONG, finished)
-            if self.slow == 2 or finished.wait(0.1):
+            if finished.wait(0.1):
                 return
+            if self.slow == 2:
+                break
         if runs:
             self._announce(runs[0], began, LONG, finished)
+        self.seen = working_time(), self.done + self.steps
+        while runs and not finished.wait(WATCHED):
+            self._announce_again(runs[0])
+
+    def _announce_again(self, run: Run) -> None:
+        """Log that the observations within a segment take longer than was announced, if they do."""
+        with self.lock:
+            now, count, (since, before) = working_time(), self.done + self.steps, self.seen
+            spent, left = now - since, self.total - count
+            if left <= 0 or spent <= LONG or (self.slow == 2 and now <= self.late):
+                self.seen = (now, count) if self.slow < 2 and count > before else self.seen
+                return
+            if count == before and run.setting.method.segment is not None:
+                return  # how many of a compiled segment are done is not known
+            rate = spent / max(count - before, 1)
+            self.slow, self.seen, self.late = 2, (now, count), now + max(OFF * rate * left, OFF * spent)
+            about, name = "about" if count > before else "at least about", run.setting.method.name
+            advice = _advice(run, rate, rate * left)
+            _LOG.warning(
+                "%s: %d more observations take %s %.0f s; %s", name, round(left / self.blocks), about, rate * left, advice
+            )
 
     def _announce(self, run: Run, began: float, long: float, finished: Event) -> None:
         """Log that runs take longer than `long` seconds, if they seem to."""
         with self.lock:
             if self.slow == 2 or finished.is_set():
                 return
-            name, shorter, now = run.setting.method.name, run.setting.method.shorter, working_time()
+            name, now = run.setting.method.name, working_time()
             count = self.done + self.steps
             if count == 0:
-                _LOG.warning("%s: the first observation takes more than %.0f s; to shorten it, %s", name, FIRST, shorter)
+                advice = _advice(run, FIRST, FIRST * self.total)
+                of_all = f"the first of {self.total / self.blocks:.0f} observations takes more than {FIRST:.0f} s"
+                _LOG.warning("%s: %s; %s", name, of_all, advice)
                 return
             # The first observation waits for what is prepared.
             rate = (now - (self.first or began)) / max(count - 1, 1)
@@ -110,7 +147,7 @@ class _Watch:
             if now - began + left > long:
                 self.slow, self.late = 2, now + OFF * left
                 about = "about" if count > 1 else "at least about"
-                _LOG.warning("%s: %d more observations take %s %.0f s; to shorten it, %s", name, more, about, left, shorter)
+                _LOG.warning("%s: %d more observations take %s %.0f s; %s", name, more, about, left, _advice(run, rate, left))
 
     def report(self, run: Run, count: int) -> None:
         """Add intervals that a run has done; log once that the rest takes long, with what shortens it."""
@@ -132,5 +169,5 @@ class _Watch:
             self.began, self.counted, self.slow = now, self.done, self.slow + 1 if left > LONG else 0
             if self.slow == 2:
                 self.late = now + OFF * left
-                name, shorter = run.setting.method.name, run.setting.method.shorter
-                _LOG.warning("%s: %d more observations take about %.0f s; to shorten it, %s", name, total - done, left, shorter)
+                name, advice = run.setting.method.name, _advice(run, left / max(self.total - self.done, 1), left)
+                _LOG.warning("%s: %d more observations take about %.0f s; %s", name, total - done, left, advice)
