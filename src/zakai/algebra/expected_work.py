@@ -23,7 +23,7 @@ POINT, PARTICLE = 9e-6, 1e-5
 AXIS = 32  # points along an axis of a grid for a density near a Gaussian
 MOST_OF_AXIS = {2: 512, 3: 128, 4: 40}  # points along an axis that a grid has at most
 MOST_POINTS = 2**18
-WIDE = 4.0  # bends of a level of h, in deviations of its noise, that widen a grid by its size once
+WIDE = 4.0  # curvature of a level of h, in deviations of its noise, that adds the points of one more grid
 PARTICLES = 5.0  # particles, times the square of the tolerance
 TOLERANCE = 0.03  # of particles, where none is asked for
 DRAWS = 64  # points of the prior at which the sensors are differentiated
@@ -58,17 +58,17 @@ def _of_grid(model: Model) -> Work:
     """Return the work of a density on a grid.
 
     A grid in a frame that is fitted to a density near a Gaussian needs equally many points for any deviations.  A precise sensor
-    leaves mass along a level of h that bends over the prior: the grid then holds the bend with the spacing of the noise.
+    leaves mass along a curved level of h: the grid then holds the range of the curve with the spacing of the noise.
     """
-    along = AXIS * (1.0 + bends(model) / WIDE)
+    along = AXIS * (1.0 + curvature(model) / WIDE)
     points = AXIS ** (model.n - 1) * along
     fails = along > MOST_OF_AXIS.get(model.n, 0)
     return Work(POINT * min(points, MOST_POINTS), f"a grid of {_display.rough(points)} points", fails)
 
 
 @once_for_a_model
-def bends(model: Model) -> float:
-    """Return by how many deviations of its noise a level of a sensor bends over the prior: the largest of all sensors.
+def curvature(model: Model) -> float:
+    """Return how curved the levels of h are over the prior, in deviations of the noise: the largest of all sensors.
 
         max_j median |J_j - median J_j| / 2,      J_j = R' grad h_j / sqrt(S_jj),  the prior has the covariance R R'
 
