@@ -165,3 +165,11 @@ def test_two_modes_keep_their_shares_and_paths_stay_in_their_mode():
     density = zakai.filter(model, record, "tensor-train").density(-1).marginal("x")
     share = np.exp(density.log_density(np.linspace(0, 5, 2001)[:, None])).sum() * 2.5e-3
     assert abs((x[:, 0] > 0).mean() - share) < 0.05
+
+
+def test_a_lost_density_smooths_to_nothing_and_says_when_it_was_lost():
+    model = track(observation=["sqrt(px**2 + py**2)", "atan2(py, px)"], observation_noise=[[1e-4, 0], [0, 1e-6]])
+    record = zakai.Record([0.5, 1.0, 1.5], [[8.0, 0.4], [400.0, 2.2], [7.0, 0.4]], "samples")
+    result = zakai.smooth(model, record, "tensor-train", tolerance=2e-2)
+    assert np.isnan(result.mean).all()
+    assert len(result.warnings) == 1 and "the density was lost at t = 1" in result.warnings[0]

@@ -67,6 +67,7 @@ def test_wrong_names_options_and_folders_are_said(tmp_path):
         "hu-yau-2002": {"forms": 2.5}, "survey": {"methods": 0}, "dong-chen-yau-2021": {"largest": True},
         "lorenz-63-sakov-2012": {"observations": 64}, "lorenz-63-ramgraber-2022": {"observations": 1},
         "heng-doob": {"observations": 1}, "heng-controlled": {"states": 3}, "al-jarrah-2024": {"largest": 11},
+        "tracking": {"observations": 1},
     }  # fmt: skip
     assert tuple(wrong) == studies.names()
     for name, options in wrong.items():

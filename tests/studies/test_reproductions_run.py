@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from zakai import studies
-from zakai.studies import cubic_sensor, lorenz_63_sakov_2012
+from zakai.studies import cubic_sensor, lorenz_63_sakov_2012, tracking
 
 
 def verdicts(reproduction) -> list[str]:
@@ -57,6 +57,17 @@ def test_particles_follow_lorenz_better_than_an_ensemble(tmp_path):
     found = studies.reproduce("lorenz-63-ramgraber-2022", tmp_path, observations=80, unused=30, particles=500)
     assert found.comparisons[-1].ours < 0.43
     assert (tmp_path / "errors.png").exists()
+
+
+def test_tensor_trains_follow_tracks_more_closely_than_a_thousand_particles(tmp_path, monkeypatch):
+    monkeypatch.setattr(tracking, "SYSTEMS", {"radar": tracking.radar, "bearings": tracking.bearings})
+    monkeypatch.setattr(tracking, "SIZES", (1000,))
+    monkeypatch.setattr(tracking, "TOLERANCES", (2e-2,))
+    found = studies.reproduce("tracking", tmp_path, observations=4, particles=40_000)
+    errors = {row[:2]: row[4] for row in found.tables[0].rows}
+    for name in tracking.SYSTEMS:
+        assert errors[name, tracking.TRAIN] < 0.5 * errors[name, tracking.BOOTSTRAP]
+    assert (tmp_path / "error-and-time.png").exists() and (tmp_path / "posterior.png").exists()
 
 
 def test_blocks_give_the_posterior_of_the_bimodal_problem(tmp_path):

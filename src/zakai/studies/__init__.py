@@ -16,7 +16,7 @@ _STUDIES = {
     name: f"zakai.studies.{name.replace('-', '_')}"
     for name in (
         "chen-luo-yau-2017", "cubic-sensor", "yau-1993", "hu-yau-2002", "survey", "dong-chen-yau-2021", "lorenz-63-sakov-2012",
-        "lorenz-63-ramgraber-2022", "heng-doob", "heng-controlled", "al-jarrah-2024",
+        "lorenz-63-ramgraber-2022", "heng-doob", "heng-controlled", "al-jarrah-2024", "tracking",
     )
 }  # fmt: skip
 

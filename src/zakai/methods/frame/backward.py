@@ -100,12 +100,14 @@ def _wrapped(prepared: Prepared, x: Array) -> Array:
 def step(prepared: Prepared, k: int, later: Message, values: Array, state: State) -> Message:
     """Return the draws at the start of interval k; `state` is the filtered one there."""
     control = state.control
+    if not np.isfinite(later.draws).all():  # the density was lost
+        return later._replace(last=False, unknown=0.0)
     chain = Chain(prepared, prepared.interval(k), values, Builder(prepared, remembered=control.kept))
     rng, x, moments, unknown = _generator(control.interval, later.seed), later.draws, later.moments, 0.0
     try:
         prediction, _, time = predicted(chain, state)
     except (Unresolved, np.linalg.LinAlgError):
-        return later._replace(draws=np.full_like(x, np.nan), moments=None, error=math.nan, last=False)
+        return later._replace(draws=np.full_like(x, np.nan), moments=None, error=math.nan, unknown=0.0, last=False)
     for move in reversed(chain.moves):
         led = move.before(x, rng)
         if moments is not None and np.isfinite(led.draws).all():

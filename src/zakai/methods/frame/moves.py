@@ -37,6 +37,16 @@ class Move(Protocol):
         """Return draws at the start of draws (n, P) at the end."""
 
 
+def _finite(draws: Array, means: Array, unknown: Array, rng: np.random.Generator) -> Led:
+    """Return draws of which those that are not finite are replaced by others: a drift as -x^3 leads back to infinity."""
+    lost = ~(np.isfinite(draws).all(axis=0) & np.isfinite(means).all(axis=0))
+    if lost.any() and not lost.all():
+        others = rng.choice(np.flatnonzero(~lost), int(lost.sum()))
+        draws, means = draws.copy(), means.copy()
+        draws[:, lost], means[:, lost] = draws[:, others], means[:, others]
+    return Led(draws, means, float(np.mean(unknown | lost)))
+
+
 @dataclass(frozen=True)
 class Flow:
     """A flow of the drift, by the path back."""
@@ -47,7 +57,7 @@ class Flow:
     def before(self, x: Array, rng: np.random.Generator) -> Led:
         """Return the starts."""
         ends, _ = self.motion.ends(x, self.path)
-        return Led(ends, ends, float(np.mean(~np.isfinite(ends).all(axis=0))))
+        return _finite(ends, ends, np.zeros(x.shape[1], bool), rng)
 
 
 @dataclass(frozen=True)
@@ -106,4 +116,4 @@ class Kick:
             found[:, own] = ends[:, own]
             means[:, used] += (values[number] / np.maximum(sums[-1], 1e-300) * ends)[:, used]
         means[:, unknown] = found[:, unknown]
-        return Led(found, means, float(np.mean(unknown)))
+        return _finite(found, means, unknown, rng)
