@@ -360,8 +360,9 @@ def steps_of(motion: Motion, interval: Interval, values: Array, pilots: Pilots, 
             count = min(4 * count, MOST_SUBSTEPS)
             continue
         wanted = int(np.clip(np.ceil(count * np.sqrt(error / TIME_ERROR)), 1, MOST_SUBSTEPS))
-        if wanted < count:
-            wanted = max(wanted, (count + 1) // 2)
+        if 2 * wanted < count and turn < 3:
+            count, shift, error, surely = wanted, shift * (count / wanted) ** 2, error * (count / wanted) ** 2, np.inf
+            continue
         reduced = (count / wanted) ** 2
         if other * reduced <= TIME_ERROR:
             return Steps(Scheme(wanted, 2), fewer * reduced, other * reduced, other_surely * reduced)
