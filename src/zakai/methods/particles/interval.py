@@ -18,7 +18,9 @@ from zakai.numerics.particles.random import key_of, normals
 from zakai.records.inputs import Inputs
 
 PILOTS = 128  # particles by which the time step is measured
-TIME_ERROR = 0.01  # of a mean or a standard deviation by one interval, in standard deviations, that a step is chosen for
+# Of a mean or a standard deviation by one interval, in standard deviations, that a step is chosen for, or this share of the
+# standard error of a mean where that is more, up to a largest one.
+TIME_ERROR, OF_RANDOM_ERROR, MOST_TIME_ERROR = 0.01, 1.0 / 3.0, 0.1
 MOST_SUBSTEPS = 64
 EXACT = 1e-3  # relative error of the flow of an affine system without time that is not measured
 KEPT_LENGTHS = 64  # of substeps whose noise is kept
@@ -325,16 +327,20 @@ class Steps(NamedTuple):
 
 
 class Pilots(NamedTuple):
-    """What measures the time step: states (n, PILOTS), their mean (n,), deviations (n,), and a whole number for the noise."""
+    """What measures the time step.
+
+    States (n, PILOTS), their mean (n,), deviations (n,), a whole number for the noise, and the error that is allowed.
+    """
 
     states: Array
     mean: Array
     scale: Array
     key: int
+    allowed: float
 
 
 def steps_of(motion: Motion, interval: Interval, values: Array, pilots: Pilots, guess: int) -> Steps:
-    """Return the cheapest scheme whose error in the mean and the spread is at most `TIME_ERROR` standard deviations.
+    """Return the cheapest scheme whose error in the mean and the spread, in standard deviations, is at most the allowed one.
 
     Args:
         motion: the formulas.
@@ -359,11 +365,12 @@ def steps_of(motion: Motion, interval: Interval, values: Array, pilots: Pilots, 
                 break
             count = min(4 * count, MOST_SUBSTEPS)
             continue
-        wanted = int(np.clip(np.ceil(count * np.sqrt(error / TIME_ERROR)), 1, MOST_SUBSTEPS))
-        if wanted < count:
-            wanted = max(wanted, (count + 1) // 2)
+        wanted = int(np.clip(np.ceil(count * np.sqrt(error / pilots.allowed)), 1, MOST_SUBSTEPS))
+        if 2 * wanted < count and turn < 3:
+            count, shift, error, surely = wanted, shift * (count / wanted) ** 2, error * (count / wanted) ** 2, np.inf
+            continue
         reduced = (count / wanted) ** 2
-        if other * reduced <= TIME_ERROR:
+        if other * reduced <= pilots.allowed:
             return Steps(Scheme(wanted, 2), fewer * reduced, other * reduced, other_surely * reduced)
         if wanted <= 2 * count:
             return Steps(Scheme(wanted, 4), shift * reduced, error * reduced, surely * reduced)

@@ -19,11 +19,11 @@ from zakai.records.schedule import Schedule
 class Control(NamedTuple):
     """What decides the next step beside the particles.
 
-    `interval` counts intervals; `substeps` with `stages`, whose `error` was measured in an interval of this `length`,
-    and is `trusted` in so many more, for `streak` of them last time; `narrow` the ratio of the deviations after and before the
-    last observation, `variance` of a mean times N, `losses` the sum of these and `work` that of steps and moves, `since` counts
-    steps after the last move and `floor` is what that has left, `doubtful_until` the number of resamplings until which standard
-    errors are lower bounds, and `shifted` the variance of the log-likelihood by the time step.
+    `interval` counts intervals; `substeps` with `stages`, whose `error` was measured in an interval of this `length`, and is
+    `trusted` in so many more, for `streak` of them last time; `narrow` the ratio of the deviations after and before the last
+    observation, `variance` of a mean times N, `losses` the sum of its means and `work` that of steps and moves, `excess` what has
+    added up since the last move beyond `floor`, what that has left, `rate` its acceptance, `doubtful_until` the number of
+    resamplings until which standard errors are lower bounds, and `shifted` the variance of the log-likelihood by the time step.
     """
 
     interval: int
@@ -37,8 +37,9 @@ class Control(NamedTuple):
     variance: float
     losses: float
     work: float
-    since: int
+    excess: float
     floor: float
+    rate: float
     doubtful_until: int
     shifted: float
 
