@@ -45,7 +45,7 @@ from zakai.models.model import Model
 from zakai.numerics.line import window as lw
 from zakai.numerics.line.density import separated
 from zakai.numerics.line.product import General, multiplied
-from zakai.numerics.line.steps import RELIABLE, error_made
+from zakai.numerics.line.resolution import RELIABLE, error_made, noise_bound
 from zakai.records.schedule import Schedule
 
 Array = Any
@@ -191,7 +191,7 @@ def single(prepared: Prepared, k: int, state: State, observed: np.ndarray) -> Si
         if prepared.weak and not np.iscomplexobj(values):
             product, check = sampled_weakly(prepared, k, values, window, observed)
         else:
-            product = multiplied(values, window, likelihood, max(1e-10, 1e-3 * prepared.tolerance))
+            product = multiplied(values, window, likelihood, noise_bound(prepared.tolerance))
             ends = lw.grid_check(product.values, product.window.closed)
             if max(ends.left, ends.right) > PILED and product.depth > prepared.deepest(floor):
                 # No state within reach explains the observation: it counts in the evidence alone.

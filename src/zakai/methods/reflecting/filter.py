@@ -39,7 +39,7 @@ from zakai.methods.reflecting.elements import (
 from zakai.models.numeric import numpy_function
 from zakai.models.prior import DensityPrior
 from zakai.numerics.line.product import General, Likelihood, place
-from zakai.numerics.line.steps import RELIABLE, error_made
+from zakai.numerics.line.resolution import RELIABLE, error_made
 from zakai.numerics.lobatto import Element
 from zakai.numerics.prior_grid import mixture_log_density, prior_grid
 

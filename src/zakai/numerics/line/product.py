@@ -24,6 +24,7 @@ from zakai.numerics.compiled import kernel
 from zakai.numerics.line import window as lw
 from zakai.numerics.line.density import moments, support
 from zakai.numerics.line.grid_choice import DEPTH, LEVELS, MOST_CELLS
+from zakai.numerics.line.resolution import GROSS
 from zakai.numerics.line.steps import exponent_added
 
 Array = NDArray[Any]
@@ -112,7 +113,7 @@ def multiplied(values: Array, window: lw.Window, likelihood: Likelihood, rough: 
         if not np.isfinite(product.log_mass.real):
             return product
         check = lw.grid_check(product.values, new.closed)
-        noisy = check.rough and check.aliasing < lw.GROSS
+        noisy = check.rough and check.aliasing < GROSS
         if check.aliasing <= 1e-11 or new.size >= (lw.LARGE if noisy else lw.SIZES[-1]):
             break
         before, new = new, finer(product.values, new, check)
