@@ -42,8 +42,10 @@ from zakai.numerics.line.product import finer
 from zakai.numerics.line.resolution import (
     GROSS,
     LOST_MASS,
+    RELIABLE,
     SPECTRUM_FACTOR,
     edge_bound,
+    error_made,
     noise_bound,
     rounding_bound,
     spectrum_bound,
@@ -309,6 +311,31 @@ class Report:
         self.aliasing = max(self.aliasing, check.aliasing)
         self.negative = max(self.negative, check.negative)
         self.edge = max(self.edge, check.left, check.right)
+
+    def figures(self, prepared: Prepared, floor: float, before: float, spacings: float) -> tuple[float, dict[str, float]]:
+        """Return the error estimate after a step and its health figures.
+
+        Args:
+            prepared: the system.
+            floor: the error of small values of the prediction, relative to the maximum.
+            before: the remainder of the error before the step.
+            spacings: the standard deviation of the density, in spacings.
+        """
+        made = error_made(self.aliasing, self.edge, self.negative, self.time, floor * self.growth)
+        error = float(max(made + before, RELIABLE * prepared.promised))
+        health = {
+            "error_estimate": error,
+            "tolerance_ratio": made / prepared.promised,
+            "edge_mass": self.edge,
+            "negative_mass": self.negative,
+            "aliasing": self.aliasing,
+            "time_error": self.time,
+            "tail_depth": self.depth / prepared.deepest(floor),
+            "std_in_spacings": spacings,
+        }
+        if prepared.system.general:
+            health["without_law"] = self.lawless
+        return error, health
 
 
 class RecordedTransition(NamedTuple):
