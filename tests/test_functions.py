@@ -12,8 +12,6 @@ MOST = 8
 # The signatures of public functions and of commands are what users call, with keywords.
 PUBLIC = {"zakai.inference.bayes.sample", "zakai.models.model.__init__"}
 WITHOUT = ("cli", "peers", "studies")
-# To be done: no folder may be added, and one without such functions must leave.
-LEFT = {"numerics/space", "methods/space"}
 
 
 def arguments(function: ast.FunctionDef | ast.AsyncFunctionDef) -> int:
@@ -40,9 +38,7 @@ def found_by_folder() -> dict[str, list[str]]:
 
 
 def test_functions_have_at_most_eight_arguments():
-    found = found_by_folder()
-    assert {folder: names for folder, names in found.items() if folder not in LEFT} == {}
-    assert set(found) == LEFT, "a folder is done: remove it from LEFT"
+    assert found_by_folder() == {}
 
 
 def test_a_function_with_nine_arguments_is_found():

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import json
-import struct
 from typing import Any
 
-import numpy as np
 from starlette.testclient import TestClient
 
+from report.frames import read
 from zakai.studio.server import Settings, Studio
 
 PORT = 8123
@@ -18,14 +17,8 @@ ORIGIN = f"http://{HOST}"
 
 def unpacked(frame: bytes) -> dict[str, Any]:
     """The header of a frame, with its arrays in it."""
-    assert frame[:4] == b"ZKF1"
-    (length,) = struct.unpack_from("<I", frame, 4)
-    header = json.loads(frame[8 : 8 + length])
-    for name, about in header.pop("arrays").items():
-        count = int(np.prod(about["shape"]))
-        found = np.frombuffer(frame, about["type"], count, 8 + length + about["offset"])
-        header[name] = found.reshape(about["shape"])
-    return header
+    header, arrays = read(frame)
+    return {**header, **arrays}
 
 
 class Page:

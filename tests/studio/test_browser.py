@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import os
 import re
-import shutil
 import subprocess
 import sys
 import time
 from pathlib import Path
 
 import pytest
-from playwright.sync_api import Browser, Page, expect, sync_playwright
+from playwright.sync_api import Browser, Page, expect
 
 import zakai
 from zakai.records import write_truth
@@ -28,17 +27,6 @@ def address():
         yield re.search(r"http://\S+", process.stdout.readline())[0]
         process.terminate()
         assert "Traceback" not in process.communicate()[1]
-
-
-@pytest.fixture(scope="module")
-def browser():
-    """Chromium; it is in Debian's package `chromium`."""
-    found = shutil.which("chromium")
-    assert found, "chromium is not installed: apt-get install chromium"
-    with sync_playwright() as driver:
-        browser = driver.chromium.launch(executable_path=found, args=["--no-sandbox"])
-        yield browser
-        browser.close()
 
 
 @pytest.fixture

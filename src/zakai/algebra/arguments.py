@@ -14,7 +14,7 @@ from math import lcm
 import sympy as sp
 from flint import fmpz_mat
 
-MOST_MULTIPLES = 24
+from zakai.algebra.integer_basis import integer_basis
 
 
 class Unreadable(Exception):
@@ -36,29 +36,18 @@ def argument_basis(arguments: Sequence[sp.Expr], x: Sequence[sp.Symbol], kind: s
     monomials = sorted({m for p in polynomials for m in p.monoms()}, reverse=True)
     rows = [[p.coeff_monomial(m) for m in monomials] for p in polynomials]
     scale = lcm(*(int(sp.Rational(c).q) for row in rows for c in row))
-    integers = fmpz_mat([[int(c * scale) for c in row] for row in rows])
-    reduced = integers.hnf()
-    basis = [[int(c) for c in row] for row in reduced.tolist() if any(row)]
+    reduced = integer_basis([[int(c * scale) for c in row] for row in rows])
     moving = [j for j, m in enumerate(monomials) if any(m[: len(x)])]
-    if fmpz_mat([[row[j] for j in moving] for row in basis]).rank() < len(basis):
+    if fmpz_mat([[row[j] for j in moving] for row in reduced.rows]).rank() < len(reduced.rows):
         raise Unreadable(f"arguments of {kind} differ by a constant, whose function is an irrational factor")
-    pivots = [next(j for j, c in enumerate(row) if c) for row in basis]
-    coordinates = []
-    for row in integers.tolist():
-        left, found = [int(c) for c in row], []
-        for vector, pivot in zip(basis, pivots):
-            times = left[pivot] // vector[pivot]
-            left = [c - times * v for c, v in zip(left, vector)]
-            found.append(times)
-        coordinates.append(found)
-    if any(abs(k) > MOST_MULTIPLES for row in coordinates for k in row):
+    if reduced.high:
         raise Unreadable(f"the arguments of {kind} are high multiples of each other")
     symbols = (*x, *constants)
     expressions = [
         sp.Add(*[sp.Rational(c, scale) * sp.prod([s**k for s, k in zip(symbols, m)]) for c, m in zip(row, monomials)])
-        for row in basis
+        for row in reduced.rows
     ]
-    return _mostly_positive(expressions, coordinates)
+    return _mostly_positive(expressions, reduced.multiples)
 
 
 def _mostly_positive(basis: list[sp.Expr], coordinates: list[list[int]]) -> tuple[list[sp.Expr], list[list[int]]]:

@@ -12,9 +12,8 @@ from typing import NamedTuple
 import sympy as sp
 from flint import fmpz_mat
 
+from zakai.algebra.integer_basis import integer_basis
 from zakai.algebra.tower import Element, OutOfBounds, Tower
-
-MOST_MULTIPLE = 24  # of an argument
 
 
 class Joint(NamedTuple):
@@ -41,20 +40,13 @@ def dependent(tower: Tower, arguments: Mapping[sp.Expr, Element]) -> Joint | Non
     width = len(monomials)
     if len(A) < 2 or width == 0 or fmpz_mat(A).rank() == len(A):
         return None
-    marked = fmpz_mat([[*row, *(int(i == j) for j in range(len(A)))] for i, row in enumerate(A)])
-    H = [[int(c) for c in row] for row in marked.hnf().tolist() if any(row[:width])]
-    values = [tower.sum(e * c for c, e in zip(row[width:], elements) if c) for row in H]
+    reduced = integer_basis(A)
+    if reduced.high:
+        raise OutOfBounds("arguments are high multiples of each other")
+    values = [tower.sum(e * c for c, e in zip(row, elements) if c) for row in reduced.combinations]
     coordinates = {}
-    for name, element, left in zip(names, elements, A):
-        multiples = []
-        for row in H:
-            pivot = next(j for j in range(width) if row[j])
-            k = left[pivot] // row[pivot]
-            left = [a - k * b for a, b in zip(left, row)]
-            multiples.append(k)
-        if max(map(abs, multiples)) > MOST_MULTIPLE:
-            raise OutOfBounds("arguments are high multiples of each other")
+    for name, element, multiples in zip(names, elements, reduced.multiples):
         rest = element - tower.sum(value * k for k, value in zip(multiples, values) if k)
         coordinates[name] = multiples, tower.expression(rest)
-    basis = [sp.Add(*[c * u for c, u in zip(row[width:], names)]) for row in H]
+    basis = [sp.Add(*[c * u for c, u in zip(row, names)]) for row in reduced.combinations]
     return Joint(basis, coordinates)

@@ -23,7 +23,8 @@ from sympy.core.function import AppliedUndef
 
 from zakai.algebra.balls import QUOTIENTS, rational
 from zakai.algebra.factors import FactoredTower
-from zakai.algebra.joint import MOST_MULTIPLE, Joint, dependent
+from zakai.algebra.integer_basis import MOST_MULTIPLE
+from zakai.algebra.joint import Joint, dependent
 from zakai.algebra.tower import Element, OutOfBounds, Slope
 from zakai.models.functions import Floor, Maximum, Minimum, Sinc, TableFunction
 

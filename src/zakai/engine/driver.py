@@ -21,6 +21,7 @@ from zakai.models.domain import check_prior
 from zakai.models.kept import kept
 from zakai.models.model import Model
 from zakai.models.possible import check_possible
+from zakai.models.prior import Prior
 from zakai.records import Inputs, Record
 
 
@@ -85,13 +86,13 @@ def filter(
 
 
 @overload
-def filter_from(prior: Any, model: Model, record: Record, method: str = ..., **options: Any) -> FilterResult: ...
+def filter_from(prior: Prior, model: Model, record: Record, method: str = ..., **options: Any) -> FilterResult: ...
 @overload
 def filter_from(
-    prior: Sequence[Any], model: Model, record: Sequence[Record], method: str = ..., **options: Any
+    prior: Sequence[Prior], model: Model, record: Sequence[Record], method: str = ..., **options: Any
 ) -> list[FilterResult]: ...
 def filter_from(
-    prior: Any, model: Model, record: Record | Sequence[Record], method: str = "auto", **options: Any
+    prior: Prior | Sequence[Prior], model: Model, record: Record | Sequence[Record], method: str = "auto", **options: Any
 ) -> FilterResult | list[FilterResult]:
     """Return what `filter` returns for another prior than the model's, moments only.
 
@@ -107,7 +108,7 @@ def filter_from(
 def _filter(
     model: Model,
     record: Record | Sequence[Record],
-    prior: Any,
+    prior: Prior | Sequence[Prior] | None,
     method: str,
     keep: str | None,
     progress: Progress | None,
@@ -117,7 +118,7 @@ def _filter(
     if many and not record:
         return []
     records = check_records(model, record)
-    priors = list(prior) if many and isinstance(prior, list | tuple) else [prior] * len(records)
+    priors: list[Prior | None] = list(prior) if isinstance(prior, Sequence) else [prior] * len(records)
     if len(priors) != len(records):
         raise InputError(f"filter_from: {len(priors)} priors do not go with {len(records)} records; give one for each")
     plans = {key: planned(model, own, method, options) for key, own in {id(own): own for own in priors}.items()}
@@ -145,7 +146,7 @@ def filter_planned(
 
 def planned(
     model: Model,
-    prior: Any,
+    prior: Prior | None,
     method: str,
     options: Mapping[str, Any],
     by_value: bool = True,

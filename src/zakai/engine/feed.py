@@ -13,7 +13,7 @@ from zakai.densities import Density
 from zakai.engine.along_path import along_path
 from zakai.engine.setting import Setting
 from zakai.errors import InputError
-from zakai.methods._protocol import Info, stacked
+from zakai.methods._protocol import Info, Prepared, stacked
 from zakai.methods.system.escape import EscapeError
 from zakai.notes.lengths import distances_of_lengths, notes_on_lengths
 from zakai.notes.misfit import notes_on_law
@@ -126,7 +126,7 @@ class Feed:
 
     def _prepared(
         self, start: float, stop: float, seen: tuple[bool, ...], elapsed: tuple[float, ...], inputs: Inputs | None = None
-    ) -> tuple[Any, tuple[str, ...]]:
+    ) -> tuple[Prepared, tuple[str, ...]]:
         """Return what is prepared for one interval, and what is to be reported of it."""
         setting = self.setting
         observed = np.array([seen])

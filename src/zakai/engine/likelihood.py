@@ -9,10 +9,11 @@ import warnings
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import sympy as sp
+from numpy.typing import ArrayLike
 
 from zakai.engine.driver import check_noise, check_records, planned, with_inputs
 from zakai.engine.loop import CHUNK, Run, segments
@@ -32,6 +33,9 @@ from zakai.records.schedule import Schedule
 
 SHORT = 0.02  # seconds of one evaluation below which threads do not pay
 JUMPS = sp.sign, Floor
+
+Argument = TypeVar("Argument")
+Value = TypeVar("Value")
 
 
 def log_likelihood(
@@ -144,7 +148,7 @@ class LogLikelihood:
         _warn(exceeded)
         return value
 
-    def value_and_gradient(self, values: Any) -> tuple[float, np.ndarray]:
+    def value_and_gradient(self, values: ArrayLike) -> tuple[float, np.ndarray]:
         """Return l and its gradient (p,) at the values (p,).
 
         Raises:
@@ -154,15 +158,15 @@ class LogLikelihood:
         _warn(exceeded)
         return value, gradient
 
-    def unwarned(self, values: Any) -> tuple[float, np.ndarray]:
+    def unwarned(self, values: ArrayLike) -> tuple[float, np.ndarray]:
         """Return what `value_and_gradient` returns, for searches that report the health of their end alone."""
         return self._evaluated(values, True)[:2]
 
-    def consistent_pair(self, values: Any) -> tuple[float, np.ndarray]:
+    def consistent_pair(self, values: ArrayLike) -> tuple[float, np.ndarray]:
         """Return l and its gradient (p,), both by complex steps, which takes less time; on a grid l differs by its accuracy."""
         return self._evaluated(values, True, own=False)[:2]
 
-    def _evaluated(self, values: Any, derivatives: bool, own: bool = True) -> tuple[float, np.ndarray, set[str]]:
+    def _evaluated(self, values: ArrayLike, derivatives: bool, own: bool = True) -> tuple[float, np.ndarray, set[str]]:
         """Return l, its gradient, zero unless `derivatives` are wanted, and the health figures beyond their bounds.
 
         Where l does not exist it is NaN.
@@ -294,7 +298,7 @@ def _total(increments: list[np.ndarray]) -> Any:
     return np.sum(np.concatenate([[0.0], *increments]))
 
 
-def _each(function: Callable[[Any], Any], arguments: Sequence[Any]) -> list[Any]:
+def _each(function: Callable[[Argument], Value], arguments: Sequence[Argument]) -> list[Value]:
     """Return the values of a function, computed on the threads of the machine unless the first one took no time."""
     began = time.monotonic()
     found, rest = [function(argument) for argument in arguments[:1]], arguments[1:]

@@ -13,7 +13,7 @@ from zakai.engine.along_path import along_path, record_along
 from zakai.engine.coarser import distances
 from zakai.engine.setting import KEPT, Setting
 from zakai.errors import InputError
-from zakai.methods._protocol import Infos, stacked
+from zakai.methods._protocol import Infos, Prepared, stacked
 from zakai.methods._states import Joined
 from zakai.methods.system.escape import EscapeError
 from zakai.notes.health import warnings_of_run
@@ -40,7 +40,7 @@ KEPT_BYTES = 512 * 2**20  # of densities that are kept by default
 
 @one_thread
 def advance(
-    setting: Setting, prepared: Any, rows: slice, state: Any, values: np.ndarray, stepped: Callable[[], None] | None = None
+    setting: Setting, prepared: Prepared, rows: slice, state: Any, values: np.ndarray, stepped: Callable[[], None] | None = None
 ) -> tuple[Sequence[Any], Infos]:
     """Advance a state over the intervals `rows` of what is prepared; `values` (rows, m) are their observations.
 
@@ -70,7 +70,7 @@ class Segment(NamedTuple):
     """
 
     first: int
-    prepared: Any
+    prepared: Prepared
     rows: slice
     before: Any
     states: Sequence[Any]

@@ -11,7 +11,7 @@ References:
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -19,6 +19,7 @@ import numpy as np
 from zakai._progress import bar
 from zakai.engine.loop import advance
 from zakai.errors import InputError
+from zakai.methods._protocol import Prepared
 from zakai.records.schedule import Schedule
 
 if TYPE_CHECKING:
@@ -71,10 +72,10 @@ class _Paths:
         self.parts = 1  # into which the next interval is divided
         self.inaccurate = 0  # intervals whose laws are not near to normal in the smallest parts
 
-    def __iter__(self) -> Any:
+    def __iter__(self) -> Iterator[tuple[int, np.ndarray]]:
         return self._by_messages() if self.run.backward.paths is not None else self._by_draws()
 
-    def _by_messages(self) -> Any:
+    def _by_messages(self) -> Iterator[tuple[int, np.ndarray]]:
         run = self.run
         assert run.backward.paths is not None
         message = run.backward.paths(run.empty, run.state, self.count, int(self.rng.integers(1, 2**32)))
@@ -85,7 +86,7 @@ class _Paths:
                 message = run.backward.step(prepared, k - begin, message, run.values[k], states[k - rows.start])
                 yield k, message.draws.T
 
-    def _by_draws(self) -> Any:
+    def _by_draws(self) -> Iterator[tuple[int, np.ndarray]]:
         run = self.run
         paths = run.setting.method.density(run.empty, run.state).sample(self.rng, self.count)
         yield len(run.schedule), paths
@@ -100,7 +101,7 @@ class _Paths:
                 "are inaccurate there; give more frequent observations", self.inaccurate, len(run.schedule),
             )  # fmt: skip
 
-    def _before(self, prepared: Any, number: int, k: int, later: np.ndarray, state: Any) -> np.ndarray:
+    def _before(self, prepared: Prepared, number: int, k: int, later: np.ndarray, state: Any) -> np.ndarray:
         """Return the draws at the start of interval k, which has this number in what is prepared."""
         draw = self.run.backward.draw
         assert draw is not None

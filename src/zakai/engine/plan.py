@@ -23,7 +23,7 @@ from zakai.errors import InputError
 from zakai.methods._protocol import Method
 from zakai.methods.system.prior_moments import prior_moments
 from zakai.models.model import Model
-from zakai.models.prior import DensityPrior, GaussianPrior
+from zakai.models.prior import DensityPrior, GaussianPrior, Prior
 from zakai.notes.lengths import notes_on_increments
 from zakai.numerics.sums.mixture import wrapped
 from zakai.records import Record
@@ -77,7 +77,7 @@ _NARROW = 0.3  # variance of an angle up to which its moments hardly depend on w
 
 def plan_of(
     model: Model,
-    prior: Any,
+    prior: Prior | None,
     method: str,
     options: Mapping[str, Any],
     by_value: bool = True,
@@ -118,7 +118,7 @@ _LAST = "guided-particles"  # which keeps a prior no better than a grid does
 
 
 def _plan_of_whole(
-    model: Model, prior: Any, method: str, options: Mapping[str, Any], unfit: Callable[[Setting], str] | None = None
+    model: Model, prior: Prior | None, method: str, options: Mapping[str, Any], unfit: Callable[[Setting], str] | None = None
 ) -> Plan:
     """Return the plan of one method for the whole system.
 

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from zakai import _display
 from zakai.engine.batch import Progress
@@ -24,7 +25,9 @@ from zakai.records.writing import shown
 KIND = "prepared"
 
 
-def prepare(model: Model, times: Any, method: str = "auto", *, inputs: Inputs | None = None, **options: Any) -> Prepared:
+def prepare(
+    model: Model, times: ArrayLike | Record, method: str = "auto", *, inputs: Inputs | None = None, **options: Any
+) -> Prepared:
     """Do what can be done before any observation is known.
 
     Args:
@@ -51,7 +54,7 @@ def prepare(model: Model, times: Any, method: str = "auto", *, inputs: Inputs | 
     return Prepared(model, method, options, record)
 
 
-def _unobserved(model: Model, times: Any) -> Record:
+def _unobserved(model: Model, times: ArrayLike | Record) -> Record:
     try:
         times = np.asarray(times, dtype=float)
     except (TypeError, ValueError):

@@ -9,11 +9,11 @@ import numpy as np
 
 from zakai.densities import Density
 from zakai.errors import InputError
-from zakai.methods._protocol import Method
+from zakai.methods._protocol import Method, Prepared
 from zakai.models.domain import NEGLIGIBLE
 from zakai.models.kept import kept
 from zakai.models.model import Model
-from zakai.models.prior import DensityPrior
+from zakai.models.prior import DensityPrior, Prior
 from zakai.numerics.one_thread import one_thread
 from zakai.records.schedule import Schedule
 
@@ -28,14 +28,14 @@ class Setting(NamedTuple):
     """
 
     model: Model
-    prior: Any
+    prior: Prior | None
     method: Method[Any, Any]
     options: Mapping[str, Any]
     theta: np.ndarray
     autonomous: bool
 
     @classmethod
-    def of(cls, model: Model, prior: Any, method: Method[Any, Any], options: Mapping[str, Any]) -> Setting:
+    def of(cls, model: Model, prior: Prior | None, method: Method[Any, Any], options: Mapping[str, Any]) -> Setting:
         """Return the setting with the model's own parameters, and the variant of the method for the model and the options."""
         method = method if method.variant is None else method.variant(model, options)
         return cls(model, prior, method, options, model.theta(), not (model.depends_on_time or method.absolute))
@@ -52,22 +52,23 @@ class Setting(NamedTuple):
         return {symbol.name for symbol in symbols}
 
     @one_thread
-    def prepared(self, schedule: Schedule) -> Any:
+    def prepared(self, schedule: Schedule) -> Prepared:
         """Return what the method prepares for a schedule, kept for the last schedules of each model.
 
         Of a model that does not depend on t every interval begins at zero, so that equal lengths are prepared equally.
         """
         schedule = schedule.from_zero() if self.autonomous else schedule
-        return kept(
+        result: Prepared = kept(
             self.model,
             "schedules",
             lambda: self.method.prepare(self.model, schedule, self.theta, **self.options),
             (self.method.name, tuple(sorted(self.options.items())), self.theta.tobytes(), *schedule.key()),
             KEPT,
         )
+        return result
 
     @one_thread
-    def begin(self) -> tuple[Any, Any]:
+    def begin(self) -> tuple[Prepared, Any]:
         """Return what is prepared for no interval, and the state at the model's start."""
         prepared = self.prepared(Schedule.empty(self.model.m))
         inside = self.model.n > 1 and bool(self.model.domain) and isinstance(self.prior, DensityPrior)

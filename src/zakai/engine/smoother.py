@@ -26,7 +26,7 @@ from zakai.engine.plan import plan_of
 from zakai.engine.results import FilterResult
 from zakai.engine.setting import Setting
 from zakai.errors import InputError
-from zakai.methods._protocol import Info, Infos, stacked
+from zakai.methods._protocol import Info, Infos, Prepared, stacked
 from zakai.methods._states import Joined
 from zakai.models.model import Model
 from zakai.numerics.one_thread import one_thread
@@ -164,7 +164,7 @@ class _Opened(NamedTuple):
     """A segment as `_segment` returns it, and those of its messages that were needed, backward in time from its end."""
 
     rows: range
-    prepared: Any
+    prepared: Prepared
     begin: int
     states: Sequence[Any]
     messages: list[Any]
@@ -193,7 +193,7 @@ class SmoothingRun(Run):
         self.after.append(states if self.held < KEPT_BYTES / 4 else None)
         super()._take(states, infos)
 
-    def _segment(self, number: int) -> tuple[range, Any, int, Sequence[Any]]:
+    def _segment(self, number: int) -> tuple[range, Prepared, int, Sequence[Any]]:
         """Return the intervals of a segment, what is prepared for them and from which interval on, and the states around them."""
         first, state = self.segments[number]
         last = self.segments[number + 1][0] if number + 1 < len(self.segments) else len(self.schedule)
@@ -240,7 +240,7 @@ class SmoothingRun(Run):
     @one_thread
     def _backward(
         self,
-        prepared: Any,
+        prepared: Prepared,
         rows: slice,
         states: Sequence[Any],
         message: Any,

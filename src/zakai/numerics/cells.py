@@ -49,10 +49,7 @@ def grid_cells(log_values: Array, closed: bool, count: int) -> tuple[float, floa
     out, cell = np.empty(count), (high - low) / count
     signed = np.take(values, np.arange(start, start + terms), mode="wrap")
     signed[1::2] *= -1.0
-    if closed:
-        _interpolate_on_circle(signed, size, start, low, cell, within, out)
-    else:
-        _interpolate(signed, start, low, cell, within, out)
+    _interpolate(signed, size if closed else 0, start, low, cell, within, out)
     return low, high, out
 
 
@@ -65,55 +62,41 @@ def arc(inside: Array) -> tuple[int, int]:
 
 
 @kernel(
-    types.void(types.float64[::1], types.int64, types.float64, types.float64, types.int64, types.float64[::1]), reordered=True
-)
-def _interpolate(signed: Array, start: int, low: float, cell: float, within: int, out: Array) -> None:
-    """Write the averages over cells of the sinc interpolant of the values (-1)^i `signed`[i] at the points `start` + i."""
-    for r in range(len(out)):
-        total = 0.0
-        for s in range(within):
-            x = low + cell * (r + (s + 0.5) / within) - start
-            nearest = math.floor(x + 0.5)
-            rest = x - nearest
-            sign = 1.0 if int(nearest) % 2 == 0 else -1.0
-            if abs(rest) < _AT:
-                total += sign * signed[int(nearest)] if 0 <= nearest < len(signed) else 0.0
-                continue
-            found = 0.0
-            for i in range(len(signed)):
-                found += signed[i] / (x - i)
-            total += sign * math.sin(math.pi * rest) / math.pi * found  # sin(pi (x - i)) = sin(pi rest) (-1)^(nearest - i)
-        out[r] = max(total / within, 0.0)
-
-
-@kernel(
     types.void(types.float64[::1], types.int64, types.int64, types.float64, types.float64, types.int64, types.float64[::1]),
     reordered=True,
 )
-def _interpolate_on_circle(signed: Array, size: int, start: int, low: float, cell: float, within: int, out: Array) -> None:
-    """Write the averages over cells of the trigonometric interpolant of `size` values, of which those not given are zero."""
-    angles = np.pi / size * np.arange(len(signed))
+def _interpolate(signed: Array, size: int, start: int, low: float, cell: float, within: int, out: Array) -> None:
+    """Write the averages over cells of the interpolant of the values (-1)^i `signed`[i] at the points `start` + i.
+
+    It is the sinc interpolant where the size is zero, else the trigonometric one of `size` values; those not given are zero.
+    """
+    count, closed = len(signed), size > 0
+    angles = np.pi / max(size, 1) * np.arange(count if closed else 0)
     cosines, sines = np.cos(angles), np.sin(angles)
     for r in range(len(out)):
         total = 0.0
         for s in range(within):
             x = low + cell * (r + (s + 0.5) / within) - start
             nearest = math.floor(x + 0.5)
-            rest = x - nearest
-            sign = 1.0 if int(nearest) % 2 == 0 else -1.0
+            rest, at = x - nearest, int(nearest) % size if closed else int(nearest)
             if abs(rest) < _AT:
-                at = int(nearest) % size
-                total += signed[at] * (1.0 if at % 2 == 0 else -1.0) if at < len(signed) else 0.0
+                total += signed[at] * (1.0 if at % 2 == 0 else -1.0) if 0 <= at < count else 0.0
                 continue
-            found = 0.0
-            c, d = math.cos(math.pi * x / size), math.sin(math.pi * x / size)
-            if size % 2:
-                for i in range(len(signed)):
+            found, c, d = 0.0, 1.0, 0.0
+            if closed:
+                c, d = math.cos(math.pi * x / size), math.sin(math.pi * x / size)
+            if not closed:
+                for i in range(count):
+                    found += signed[i] / (x - i)
+            elif size % 2:
+                for i in range(count):
                     found += signed[i] / (d * cosines[i] - c * sines[i])
             else:
-                for i in range(len(signed)):
+                for i in range(count):
                     found += signed[i] * (c * cosines[i] + d * sines[i]) / (d * cosines[i] - c * sines[i])
-            total += sign * math.sin(math.pi * rest) / size * found
+            # sin(pi (x - i)) = sin(pi rest) (-1)^(nearest - i)
+            sine = math.sin(math.pi * rest) * (1.0 if int(nearest) % 2 == 0 else -1.0)
+            total += sine / (size if closed else math.pi) * found
         out[r] = max(total / within, 0.0)
 
 

@@ -16,12 +16,10 @@ from zakai.algebra.theorems import limited_direct
 from zakai.errors import InputError
 from zakai.methods._options import one_of, tolerance_of
 from zakai.methods._protocol import Method
-from zakai.methods.grid.yau_yau import BOUNDS, LOST, in_space, on_line
+from zakai.methods.grid.yau_yau import METHOD as YAU_YAU
+from zakai.methods.grid.yau_yau import in_space, on_line
 from zakai.methods.line import filter as line_filter
-from zakai.methods.line import tangents as line_tangents
-from zakai.methods.line.backward import BACKWARD as LINE
 from zakai.methods.line.model import in_pieces
-from zakai.methods.line.prepared import State
 from zakai.methods.line.yau import yau_line_of
 from zakai.methods.yau.system import power_series_of
 from zakai.models import features
@@ -87,7 +85,8 @@ def variant(model: Model, options: Mapping[str, Any]) -> Method[Any, Any]:
     return on_line(METHOD, model) if model.n == 1 else in_space(METHOD, prepare)
 
 
-METHOD: Method[Any, Any] = Method(
+METHOD: Method[Any, Any] = replace(
+    YAU_YAU,
     name="limited-direct",
     source="Chen, Luo and Yau 2017, Theorems 1-3, corrected; x-coordinate form",
     exactness="exact between observations for every h in the class; increments with y linear between observations, with one "
@@ -95,18 +94,6 @@ METHOD: Method[Any, Any] = Method(
     theorem=limited_direct,
     options={"kernel": "flow", "splitting": "strang", "order": None, "tolerance": None},
     prepare=prepare,
-    init=line_filter.init,
-    step=line_filter.step,
-    density=line_filter.density,
-    state=State,
-    bounds=BOUNDS,
-    losses=LOST,
-    shorter="raise the option tolerance (command: --option tolerance=...)",
     variant=variant,
-    valid=line_filter.valid,
     handles=features.OF_OBSERVATION | {features.INPUTS, features.JUMPS, features.KINKS, features.SINC, features.TABLES},
-    segment=line_filter.segment,
-    tangents=line_tangents.tangents,
-    rescheduled=line_filter.rescheduled,
-    backward=LINE,
 )

@@ -24,6 +24,8 @@ from zakai.methods.line.volumes import WIDENINGS, cell_plan_of, ends_of, pulled_
 from zakai.numerics.line import window as lw
 from zakai.numerics.line.backward import EXCURSION, FEWEST, ROUNDING
 from zakai.numerics.line.density import support
+from zakai.numerics.line.resolution import ROUNDING as PRECISION
+from zakai.numerics.line.resolution import SPECTRUM_FACTOR
 from zakai.numerics.line.window import local_polynomial
 
 Array = Any
@@ -166,7 +168,7 @@ def _by_modes(
     """Return the same by a decomposition, None where there is none or rounding in psi counts."""
     if prepared.system.varying or prepared.system.rough or interval.inside.any():
         return None
-    length, accepted = interval.length, max(negligible(prepared), 30.0 * prepared.negligible)
+    length, accepted = interval.length, max(negligible(prepared), SPECTRUM_FACTOR * prepared.negligible)
     low, high = min(later.ends[0], ends[0]), max(later.ends[1], ends[1])
     least, most = _noise(prepared, interval.k, state.origin + low, state.origin + high)
     low, high = low - EXCURSION * most, high + EXCURSION * most  # paths from one support to the other leave both
@@ -183,7 +185,7 @@ def _by_modes(
         highest = float(np.max(propagated))
         if not 0.0 < highest < np.inf:
             return None
-        error = 4e-16 * float(np.sqrt(np.sum(psi * psi))) * growth / highest
+        error = PRECISION * float(np.sqrt(np.sum(psi * psi))) * growth / highest
         if not _exact(prepared, state, propagated, operator.logs, window, error):
             return None
         check = lw.grid_check(propagated, False, accepted)

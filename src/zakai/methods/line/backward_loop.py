@@ -22,6 +22,7 @@ from zakai.numerics.line import backward as lb
 from zakai.numerics.line import window as lw
 from zakai.numerics.line.backward import EXCURSION, by_adjoints
 from zakai.numerics.line.density import support
+from zakai.numerics.line.resolution import ROUNDING as PRECISION
 from zakai.numerics.line.steps import SPLIT, SPLIT_FACTOR
 
 Array = Any
@@ -100,7 +101,7 @@ def _exact(prepared: Prepared, k: int, state: State) -> bool:
     displacement, _ = displaced(prepared, values, state.window, start, length)
     noise = length * covariance_at(prepared.system, np.array([state.origin + mean]), start, prepared.theta.real)
     lost = displacement**2 / noise * (1.0 + variance / noise)
-    return bool(np.all(lost < np.log(lb.ROUGH * smoothing_tolerance(prepared) / lb.NOISE)))
+    return bool(np.all(lost < np.log(lb.ROUGH * smoothing_tolerance(prepared) / PRECISION)))
 
 
 def _on_one_grid(

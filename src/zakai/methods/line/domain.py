@@ -39,7 +39,7 @@ from zakai.models.kept import kept, once_for_a_model
 from zakai.models.model import Model
 from zakai.models.numeric import numpy_function
 from zakai.numerics.line import window as lw
-from zakai.numerics.line.window import EDGE
+from zakai.numerics.line.resolution import EDGE
 
 Array = Any
 

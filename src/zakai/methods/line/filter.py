@@ -45,7 +45,7 @@ from zakai.models.model import Model
 from zakai.numerics.line import window as lw
 from zakai.numerics.line.density import separated
 from zakai.numerics.line.product import General, multiplied
-from zakai.numerics.line.steps import RELIABLE, error_made
+from zakai.numerics.line.resolution import noise_bound
 from zakai.records.schedule import Schedule
 
 Array = Any
@@ -191,7 +191,7 @@ def single(prepared: Prepared, k: int, state: State, observed: np.ndarray) -> Si
         if prepared.weak and not np.iscomplexobj(values):
             product, check = sampled_weakly(prepared, k, values, window, observed)
         else:
-            product = multiplied(values, window, likelihood, max(1e-10, 1e-3 * prepared.tolerance))
+            product = multiplied(values, window, likelihood, noise_bound(prepared.tolerance))
             ends = lw.grid_check(product.values, product.window.closed)
             if max(ends.left, ends.right) > PILED and product.depth > prepared.deepest(floor):
                 # No state within reach explains the observation: it counts in the evidence alone.
@@ -209,23 +209,10 @@ def single(prepared: Prepared, k: int, state: State, observed: np.ndarray) -> Si
         report.aliasing = max(report.aliasing, coarse)
     mean, variance = lw.moments(values, window)
     report.edge = max(report.edge, edge_of_moments(prepared, values, window))
-    made = error_made(report.aliasing, report.edge, report.negative, report.time, floor * report.growth)
     retained = error_remainder(before[1], mean_and_variance[1], variance, spread(prepared, k, length, window.origin + mean.real))
-    error = made + state.error * (1.0 if separated(np.ascontiguousarray(values.real)) else retained)
-    error = max(error, RELIABLE * prepared.promised)
+    error_before = state.error * (1.0 if separated(np.ascontiguousarray(values.real)) else retained)
     spacings = float(np.sqrt(max(variance.real, 0.0))) / window.spacing
-    health = {
-        "error_estimate": error,
-        "tolerance_ratio": made / prepared.promised,
-        "edge_mass": report.edge,
-        "negative_mass": report.negative,
-        "aliasing": report.aliasing,
-        "time_error": report.time,
-        "tail_depth": report.depth / prepared.deepest(floor),
-        "std_in_spacings": spacings,
-    }
-    if prepared.system.general:
-        health["without_law"] = report.lawless
+    error, health = report.figures(prepared, floor, error_before, spacings)
     if prepared.system.tabulated:
         health["outside_tables"] = outside_tables(prepared, values, window, float(schedule.stops[k]))
     mean, variance = state_moments(prepared, values, window, mean, variance)
@@ -233,7 +220,7 @@ def single(prepared: Prepared, k: int, state: State, observed: np.ndarray) -> Si
         mean = mean - 2 * np.pi * np.ceil((mean.real - np.pi) / (2 * np.pi))
     log_floor = min(log_floor + max(report.depth - 1.0, 0.0), 0.0)
     info = Info(gained, np.array([mean]), np.array([[variance]]), health)
-    return SingleStep(state_of(new_values, new, float(error), log_floor), info, transitions, values, window)
+    return SingleStep(state_of(new_values, new, error, log_floor), info, transitions, values, window)
 
 
 def valid(prepared: Prepared, state: State) -> bool:

@@ -10,6 +10,7 @@ from zakai.methods.line.prepared import Prepared, TimeInterval
 from zakai.methods.line.transition import Prediction, Report
 from zakai.numerics.line import window as lw
 from zakai.numerics.line.gaussian_kernels import WIDE, Channel, applied, around, chosen, wrapped
+from zakai.numerics.line.resolution import noise_bound
 
 Array = Any
 
@@ -55,7 +56,7 @@ def _along(
 ) -> Prediction | None:
     """Return a density on the line after an interval."""
     yau, theta, cut, negligible = prepared.yau, prepared.theta, prepared.cut, prepared.negligible
-    width, rough = np.sqrt(np.abs(kernel.variance.real)), max(1e-10, 1e-3 * prepared.tolerance)
+    width, rough = np.sqrt(np.abs(kernel.variance.real)), noise_bound(prepared.tolerance)
     if yau is None or not width > NARROWEST * window.spacing * abs(kernel.scale.real):
         return None
     sources = window.offsets

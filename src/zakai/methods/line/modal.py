@@ -26,8 +26,8 @@ from zakai.numerics.line import window as lw
 from zakai.numerics.line.density import circular_rows, waves
 from zakai.numerics.line.grid_choice import PER, SPACING
 from zakai.numerics.line.product import General, at_nodes, nodes, weaken
+from zakai.numerics.line.resolution import edge_bound, rounding_bound, spectrum_bound
 from zakai.numerics.line.steps import COLUMNS, STATUSES, Status
-from zakai.numerics.line.window import EDGE
 
 Array = Any
 
@@ -226,7 +226,6 @@ def coarsened(prepared: Prepared, values: Array, window: lw.Window, length: floa
     spacing = window.unit * 2.0 ** np.floor(np.log2(SPACING * deviation / window.unit) + 1e-9)
     wide = float(np.sqrt(np.max(covariance.real) * length))
     low, high = window.offsets[check.first] - COARSE_MARGIN * wide, window.offsets[check.last] + COARSE_MARGIN * wide
-    allowed = 1e-5 * prepared.tolerance
     for _ in range(TRIALS):
         coarse = _grid(window, float(low - COARSE_MARGIN * wide), float(high + COARSE_MARGIN * wide), float(spacing))
         decomposed = spectral(prepared, coarse) if coarse.size <= lw.LARGEST else None
@@ -241,14 +240,14 @@ def coarsened(prepared: Prepared, values: Array, window: lw.Window, length: floa
         ends = np.flatnonzero(trusted)[[0, 1, -2, -1]]
         result = np.where(trusted, result, 0.0)
         after = lw.grid_check(result, False, prepared.negligible)
-        bound = max(EDGE, 4.0 * after.aliasing)
+        bound = edge_bound(after.aliasing)
         left, right = np.max(np.abs(result[ends]).reshape(2, 2), axis=1) > bound * np.max(result.real)
         if left or right:
             third = (high - low) / 3.0
             low, high = low - third * left, high + third * right
-        elif after.aliasing > max(30.0 * prepared.negligible, allowed):
+        elif after.aliasing > spectrum_bound(prepared.negligible, prepared.tolerance):
             spacing *= 0.5
-        elif error > max(1e-11, allowed):
+        elif error > rounding_bound(prepared.tolerance):
             return None
         else:
             return Coarsened(result, coarse, error, (int(ends[0]), coarse.size - 1 - int(ends[-1])))

@@ -27,6 +27,7 @@ from zakai.numerics.line import window as lw
 from zakai.numerics.line.averages import GAUSS_NODES, parts_needed, probed
 from zakai.numerics.line.density import support
 from zakai.numerics.line.gaussian_kernels import kernel_size, packed
+from zakai.numerics.line.resolution import GROSS
 from zakai.numerics.line.steps import FACTOR, KERNEL, SPLIT, SPLIT_FACTOR, Limits, Mechanisms, Steps
 from zakai.numerics.line.window import CUT, Window
 from zakai.records.schedule import Schedule, lengths_of
@@ -249,7 +250,7 @@ class Prepared:
         """
         noisy, system = False, self.system
         if check is not None and check.aliasing > self.negligible:
-            noisy = check.rough if check.aliasing < lw.GROSS else size >= lw.SIZES[-1]
+            noisy = check.rough if check.aliasing < GROSS else size >= lw.SIZES[-1]
         slow = noisy or system.kinked_drift or not system.smooth_observation or system.state_dependent or not system.samples
         return self.largest if slow else lw.SIZES[-1]
 

@@ -39,7 +39,17 @@ from zakai.numerics.line.averages import GAUSS_NODES, GAUSS_WEIGHTS
 from zakai.numerics.line.grid_choice import REACH
 from zakai.numerics.line.operator import FourierOperator, exponential_of
 from zakai.numerics.line.product import finer
-from zakai.numerics.line.window import EDGE
+from zakai.numerics.line.resolution import (
+    GROSS,
+    LOST_MASS,
+    RELIABLE,
+    SPECTRUM_FACTOR,
+    edge_bound,
+    error_made,
+    noise_bound,
+    rounding_bound,
+    spectrum_bound,
+)
 
 Array = Any
 
@@ -278,11 +288,10 @@ def by_modes(prepared: Prepared, values: Array, window: lw.Window, length: float
     result, error = decomposed(values, length)
     # Tails that were cut off are jumps in the gauge of the decomposition, which show at the highest frequencies, as does a
     # density that reaches the ends of the grid: that one needs another grid, not another transition.
-    allowed = 1e-5 * prepared.tolerance
     check = lw.grid_check(result, window.closed, prepared.negligible)
-    aliased = check.aliasing > max(allowed, 30.0 * prepared.negligible)
-    ended = max(check.left, check.right) > max(EDGE, 4.0 * check.aliasing)
-    return (result, error) if error < max(1e-11, allowed) and (ended or not aliased) else None
+    aliased = check.aliasing > spectrum_bound(prepared.negligible, prepared.tolerance)
+    ended = max(check.left, check.right) > edge_bound(check.aliasing)
+    return (result, error) if error < rounding_bound(prepared.tolerance) and (ended or not aliased) else None
 
 
 MOST_SUBSTEPS = 4000
@@ -302,6 +311,31 @@ class Report:
         self.aliasing = max(self.aliasing, check.aliasing)
         self.negative = max(self.negative, check.negative)
         self.edge = max(self.edge, check.left, check.right)
+
+    def figures(self, prepared: Prepared, floor: float, before: float, spacings: float) -> tuple[float, dict[str, float]]:
+        """Return the error estimate after a step and its health figures.
+
+        Args:
+            prepared: the system.
+            floor: the error of small values of the prediction, relative to the maximum.
+            before: the remainder of the error before the step.
+            spacings: the standard deviation of the density, in spacings.
+        """
+        made = error_made(self.aliasing, self.edge, self.negative, self.time, floor * self.growth)
+        error = float(max(made + before, RELIABLE * prepared.promised))
+        health = {
+            "error_estimate": error,
+            "tolerance_ratio": made / prepared.promised,
+            "edge_mass": self.edge,
+            "negative_mass": self.negative,
+            "aliasing": self.aliasing,
+            "time_error": self.time,
+            "tail_depth": self.depth / prepared.deepest(floor),
+            "std_in_spacings": spacings,
+        }
+        if prepared.system.general:
+            health["without_law"] = self.lawless
+        return error, health
 
 
 class RecordedTransition(NamedTuple):
@@ -333,7 +367,7 @@ class Prediction(NamedTuple):
 
 def by_decomposition(prepared: Prepared, values: Array, window: lw.Window, length: float, report: Report) -> Prediction | None:
     """Return the density after an interval without observations inside by modes of its operator, None where they do not serve."""
-    negligible, rough = prepared.negligible, max(1e-10, 1e-3 * prepared.tolerance)
+    negligible, rough = prepared.negligible, noise_bound(prepared.tolerance)
     carried = coarsened(prepared, values, window, length)
     if carried is not None:
         transition = RecordedTransition(values, window, length, 0.0, carried.window, margins=carried.margins)
@@ -341,12 +375,12 @@ def by_decomposition(prepared: Prepared, values: Array, window: lw.Window, lengt
     known, begin = lw.grid_check(values, window.closed, negligible).aliasing, window
     while window.size <= lw.LARGEST:
         result = by_modes(prepared, values, window, length)
-        if result is None or not lost(float(np.sum(result[0].real))) < 1e-3:
+        if result is None or not lost(float(np.sum(result[0].real))) < LOST_MASS:
             return None
         check = lw.grid_check(result[0], window.closed, negligible)
         if check.unresolved(negligible, rough):
             return None
-        bound = max(EDGE, 4.0 * check.aliasing)
+        bound = edge_bound(check.aliasing)
         left, right = check.left > bound, check.right > bound
         if not (left or right):
             missing = lost(float(np.sum(result[0].real)))
@@ -394,7 +428,7 @@ def _by_substeps(
     system, negligible, check = prepared.system, prepared.negligible, None
     _, start, length, inside, rates = interval
     gained: Any = 0.0
-    rough, resolved = max(1e-10, 1e-3 * prepared.tolerance), 30.0 * negligible
+    rough, resolved = noise_bound(prepared.tolerance), SPECTRUM_FACTOR * negligible
     report.positive = False
     bounds = [(0.0, length)]
     if system.varying:
@@ -418,31 +452,31 @@ def _by_substeps(
             report.decomposed = trial.substep is None
             total = float(np.sum(trial.values.real))
             missing = 0.0 if inside.any() else lost(total)
-            failed = not 1e-100 < total < 1e6 or missing > 1e-3
+            failed = not 1e-100 < total < 1e6 or missing > LOST_MASS
             split = (trial.split or failed) and last - first > 1e-12 * length and substeps + len(stack) < MOST_SUBSTEPS
             if split:
                 break
             check = lw.grid_check(trial.values, window.closed, negligible)
             coarse = check.unresolved(negligible, rough)
             coarse = coarse and (not prepared.weak or known <= resolved)  # a finer grid has no more of the spectrum of a kink
-            bound = max(EDGE, 4.0 * check.aliasing)
+            bound = edge_bound(check.aliasing)
             left, right = check.left > bound, check.right > bound
             if not (left or right or coarse):
                 break
             new = window
             smooth = lw.grid_check(values, window.closed, negligible).aliasing < 0.1 * rough
-            if check.aliasing > lw.GROSS and smooth:
+            if check.aliasing > GROSS and smooth:
                 new = window  # what such an attempt shows of the edges is not the density
             elif left or right:
                 new, grown = lw.enlarged(new, left, right), True
-            if coarse and window.size < most and not (check.aliasing > lw.GROSS and smooth):
+            if coarse and window.size < most and not (check.aliasing > GROSS and smooth):
                 new = lw.refined(new) if grown else finer(values, window, check)
             if new.size <= most and new != window and not window.size == new.size == lw.SIZES[-1]:
                 values = lw.resampled(values, window, new)
                 window = new
                 continue
             # The grid is as large as it may be: take a shorter substep, unless that does not help.
-            helps = smooth and check.aliasing > rough and (not check.rough or check.aliasing > lw.GROSS)
+            helps = smooth and check.aliasing > rough and (not check.rough or check.aliasing > GROSS)
             split = (left or right or helps) and last - first > 1e-12 * length
             split = split and substeps + len(stack) < MOST_SUBSTEPS
             break

@@ -28,6 +28,7 @@ from zakai.numerics.line.product import (
     Product,
     at_nodes,
     nodes,
+    normalized,
     weak,
     weak_error,
     weaken,
@@ -213,11 +214,7 @@ def sampled_weakly(
         fine = at_nodes(system.observation(nodes(window.points, window.spacing)[:, None], start, theta).T)
         logs, change = np.full(window.size, -np.inf), np.ones(window.size)
         weaken(fine, 0, precision, observed, np.ascontiguousarray(centre), logs, change)
-        known = np.where(values > 0, np.log(np.where(values > 0, values, 1.0)), -np.inf)
-        best = float(np.max(known + logs))
-        product = np.exp(known + logs - best)
-        total = float(np.sum(product))
-        product = product / total
+        product, gained, depth, growth = normalized(values, logs, np.ones(window.size), float(values.max()))
         error = 0.5 * weak_error(product, change)
         new, covers = _finer(prepared, product, window)
         if error <= WEAK_SHARE * prepared.tolerance or new.size > prepared.largest or not covers:
@@ -225,10 +222,7 @@ def sampled_weakly(
         # From the whole density: one that ends within a grid cannot be interpolated there.
         values, window = lw.resampled(*source, new), new
     rest = observed - centre
-    gained = np.log(total) + best + constant - 0.5 * rest @ precision @ rest
-    reference = float(np.log(values.max()))
-    growth = float(np.sum(np.exp(np.minimum(logs + reference - best - np.log(total), 200.0))))
-    depth = float(product @ np.where(product > 0, reference - known, 0.0))
+    gained = gained + constant - 0.5 * rest @ precision @ rest
     check = grid_check(prepared, product, window)._replace(aliasing=error)
     return Product(product, gained, depth, growth, window), check
 

@@ -19,6 +19,7 @@ from zakai.methods.line.prepared import Prepared, TimeInterval
 from zakai.methods.line.transition import Prediction, Report
 from zakai.numerics.line import window as lw
 from zakai.numerics.line.averages import GAUSS_NODES, Panels, interpolation
+from zakai.numerics.line.resolution import ROUNDING
 from zakai.numerics.line.volumes import Bands, Volumes, advanced, ends_of_steps, volumes
 from zakai.numerics.line.window import local_polynomial
 
@@ -217,7 +218,6 @@ EDGE = 1e-9  # density in the outermost cells, relative to the maximum, beyond w
 SETTLED = 1e-2  # error above which volumes do not serve
 NARROWEST = 40.0  # range of a density in cells
 SHARE = 0.1  # of the tolerance that volumes may leave
-ROUNDING = 4e-16  # error of the exponential of an operator, relative to its norm
 WIDENINGS = 0.5, 2.0  # ranges of a density by which it grows on each side, where that error is too large
 SMOOTH = 1e-7  # error of a backward interval at which more cells are not tried
 

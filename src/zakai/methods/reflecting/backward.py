@@ -45,6 +45,7 @@ from zakai.methods.reflecting.filter import State
 from zakai.numerics.line import window as lw
 from zakai.numerics.line.backward import ROUNDING
 from zakai.numerics.line.density import support
+from zakai.numerics.line.resolution import ROUNDING as PRECISION
 from zakai.numerics.lobatto import Element
 
 Array = Any
@@ -239,7 +240,7 @@ def _by_modes(
         propagated = modes.decayed(psi, length)
         at, log_s, scaled = element.interpolation(own.points), modes.top - known.logs, propagated / root
         own_weights = np.abs(values) * np.exp(at @ log_s)
-        wrong = max(4e-16 * float(np.exp(-length * modes.rates[0])), element.unresolved(propagated * root))
+        wrong = max(PRECISION * float(np.exp(-length * modes.rates[0])), element.unresolved(propagated * root))
         wrong = wrong * max(float(np.sqrt(psi @ psi)), float(np.max(np.abs(scaled))))
         error = wrong * float(np.sum(own_weights)) / float(own_weights @ (at @ scaled))
         if 0.0 <= error < SHARE * smoothing_tolerance(prepared):

@@ -24,6 +24,7 @@ from zakai.methods.line.volumes import SHARE, advanced_by, cell_plan_of, kinks_b
 from zakai.models.domain import Interval
 from zakai.numerics.line.averages import GAUSS_NODES, GAUSS_WEIGHTS
 from zakai.numerics.line.operator import Spectral
+from zakai.numerics.line.resolution import rounding_bound
 from zakai.numerics.lobatto import Element
 
 Array = Any
@@ -220,7 +221,7 @@ def _by_modes(
     prepared: Prepared, values: Array, element: Element, interval: TimeInterval, report: Report, negligible: float
 ) -> tuple[Array, Element, Any] | None:
     """Return the density after an interval, its points, and the logarithm of its mass; None where modes do not serve."""
-    domain, allowed = domain_of(prepared), max(1e-11, 1e-5 * prepared.tolerance)
+    domain, allowed = domain_of(prepared), rounding_bound(prepared.tolerance)
     _, start, length, inside, _ = interval
     G = covariance_at(prepared.system, element.points, start, prepared.theta).real
     noise = np.sqrt(np.maximum([np.min(G), np.max(G)], 0.0) * length)

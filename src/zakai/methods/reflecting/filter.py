@@ -38,13 +38,13 @@ from zakai.methods.reflecting.elements import (
 )
 from zakai.models.numeric import numpy_function
 from zakai.models.prior import DensityPrior
-from zakai.numerics.line.product import General, Likelihood, place
-from zakai.numerics.line.steps import RELIABLE, error_made
+from zakai.numerics.line.product import General, Likelihood, normalized, place
 from zakai.numerics.lobatto import Element
 from zakai.numerics.prior_grid import mixture_log_density, prior_grid
 
 Array = Any
 
+DEPTH_OF_PRODUCT = 70.0  # logarithm of the density below its maximum, from which a product does not come
 
 class State(NamedTuple):
     """The probabilities (N,) of the Gauss-Lobatto points between `lower`, `cuts` (C,) and `upper`; an estimate of their error."""
@@ -116,38 +116,28 @@ def _multiplied(
     prepared: Prepared, values: Array, element: Element, likelihood: Likelihood, report: Report, negligible: float
 ) -> tuple[Any, ...]:
     """Return the product with a likelihood, its points, and the logarithm of its mass."""
-    domain = domain_of(prepared)
-    peak = logarithm(np.max((values / element.weights).real))
+    domain, new, density = domain_of(prepared), element, values / element.weights
+    largest = float(np.max(density.real))
 
-    def product(x: Array, density: Array) -> tuple[Array, Array]:
-        # Relative to the largest product: neither factor needs to be a number there.
-        logs = without_nan(likelihood.logs(x))
-        own = np.where(density.real > 0, logarithm(density.real), -np.inf)
-        top = np.max(own + logs.real)
-        relative = density / np.where(density.real > 0, density.real, 1.0)
-        return np.where(density.real > 0, relative * np.exp(own + logs - top), 0.0), top
+    def product() -> tuple[Array, Any, float, float]:
+        return normalized(density, without_nan(likelihood.logs(new.points)), new.weights, largest)
 
-    new, density = element, values / element.weights
-    result, top = product(new.points, density)
-    if not new.unresolved(result * new.weights) < negligible or _narrow(result * new.weights, new):
-        ends = place(element.offsets, np.maximum(logarithm(density.real), peak - 70.0), likelihood, element.lower)
+    result, gained, depth, growth = product()
+    if not new.unresolved(result) < negligible or _narrow(result, new):
+        lowest = logarithm(largest) - DEPTH_OF_PRODUCT
+        ends = place(element.offsets, np.maximum(logarithm(density.real), lowest), likelihood, element.lower)
         if ends is not None:
             low, high = with_margin(element.lower + ends[0], element.lower + ends[1], domain)
             low, high = max(low, element.lower), min(high, element.upper)
             for size in SIZES:
                 new = element_of(prepared, low, high, size)
                 density = element.at(values, new.points)
-                result, top = product(new.points, density)
-                if new.unresolved(result * new.weights) < negligible:
+                result, gained, depth, growth = product()
+                if new.unresolved(result) < negligible:
                     break
-    result = result * new.weights
-    report.aliasing = max(report.aliasing, new.unresolved(result))
-    mass = np.sum(result)
-    result = result / mass
-    report.depth = float(result.real @ (peak - logarithm(density.real)))
-    growth = np.exp(np.minimum(without_nan(likelihood.logs(new.points)).real + peak - top - np.log(mass.real), 80.0))
-    report.growth = max(report.growth, 1.0) * float(np.sum(new.weights * growth))
-    return result, new, np.log(mass) + top
+    report.aliasing, report.depth = max(report.aliasing, new.unresolved(result)), depth
+    report.growth = max(report.growth, 1.0) * growth
+    return result, new, gained
 
 
 def _narrow(values: Array, element: Element) -> bool:
@@ -181,25 +171,12 @@ def _step(prepared: Prepared, k: int, state: State, observed: np.ndarray) -> tup
         values, element, more = _multiplied(prepared, values, element, likelihood, report, negligible)
         gained = gained + more
     mean, variance = moments(values, element)
-    made = error_made(report.aliasing, report.edge, report.negative, report.time, floor * report.growth)
     retained = error_remainder(before[1], predicted[1], variance, spread(prepared, k, length, float(mean.real)))
-    error = max(made + state.error * retained, RELIABLE * prepared.promised)
-    health = {
-        "error_estimate": error,
-        "tolerance_ratio": made / prepared.promised,
-        "edge_mass": report.edge,
-        "negative_mass": report.negative,
-        "aliasing": report.aliasing,
-        "time_error": report.time,
-        "tail_depth": report.depth / prepared.deepest(floor),
-        "std_in_spacings": float(np.sqrt(max(variance.real, 0.0))) / element.spacing,
-    }
-    if prepared.system.general:
-        health["without_law"] = report.lawless
+    spacings = float(np.sqrt(max(variance.real, 0.0))) / element.spacing
+    error, health = report.figures(prepared, floor, state.error * retained, spacings)
     if prepared.system.tabulated:
         health["outside_tables"] = outside_tables(prepared, values, element, float(schedule.stops[k]))
-    state = State.of(values, element, float(error))
-    return state, Info(gained, np.array([mean]), np.array([[variance]]), health)
+    return State.of(values, element, error), Info(gained, np.array([mean]), np.array([[variance]]), health)
 
 
 def valid(prepared: Prepared, state: State) -> bool:

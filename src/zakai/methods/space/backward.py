@@ -33,7 +33,7 @@ from zakai.numerics.space.step import Stepper, Substep
 from zakai.numerics.space.survey import survey
 from zakai.numerics.space.transport import Dynamics, Linearisation
 from zakai.numerics.space.update import Update, updated
-from zakai.numerics.space.window import LEAST, Bounds, fitted_grid
+from zakai.numerics.space.window import LEAST, Bounds, Points, fitted_grid
 
 Array = Any
 FINEST = 1e-4  # tolerance to which a method that is more accurate than splines is smoothed
@@ -175,8 +175,8 @@ def _substeps(
             stepper.equal(begin, times, potential, extrapolated)
             return [(stepper, group) for group in stepper.taken]
     steppers: list[Stepper] = []
-    rates = values / max(length, 1e-300)
-    general.predicted(begin, parts, inside, rates, control, allowed, general.bounds, steppers, fewest)
+    increments = base.Increments(inside, values / max(length, 1e-300))
+    general.predicted(begin, parts, increments, control, allowed, general.bounds, steppers, fewest)
     return [(stepper, group) for stepper in steppers for group in stepper.taken]
 
 
@@ -215,7 +215,7 @@ def _start(density: Field, bounds: Bounds, rough: Callable[[Grid], Array]) -> Gr
     if finer.max() > FINER:
         noise, narrow = 0.25 * grid.basis @ grid.basis.T, np.ones(grid.n)
         least = float(np.log(bounds.edge))
-        return fitted_grid(coarse.offsets, levels.reshape(-1), grid.centre, noise, narrow, bounds, grid, least=least)
+        return fitted_grid(Points(coarse.offsets, levels.reshape(-1), grid.centre, least), noise, narrow, bounds, grid)
     low, high = 2 * (found.used.T - coarse.shape // 2) + np.array([[-AROUND], [AROUND]])
     sizes = tuple(
         rounded_size((b - a + 1) * ratio, LEAST[grid.n], 2 * bounds.most)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -48,6 +48,13 @@ SHARE = 0.2  # of the tolerance, for the error in time of one interval
 LOST = 0.5  # error of a density relative to itself
 KEPT = 0.98  # largest share of an error that an interval is taken to leave
 WIDER = 1.1  # growth of the deviations after which the error of a substep is measured again
+
+
+class Increments(NamedTuple):
+    """Which coordinates (m,) act `inside` an interval, and at which `rates` (m,)."""
+
+    inside: Array
+    rates: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,14 +126,14 @@ class Prepared:
         quick, bounds = None, self.bounds
         if not (self.correlated and inside.any()) and bounds.finer == 1.0:
             quick = predicted_on(self, begin, control, allowed, length, potential)
-        rates = values / max(length, 1e-300)
+        increments = Increments(inside, values / max(length, 1e-300))
         before: tuple[Field, Report, Control, Update] | None = None
         for _ in range(4):
             found: Survey | None = None  # of this prediction: a repetition is on another grid
             if quick is not None:
                 (predicted, report, after), found, quick = quick[:3], quick[3] if factor is None else None, None
             else:
-                predicted, report, after = self.predicted(begin, parts, inside, rates, control, allowed, bounds)
+                predicted, report, after = self.predicted(begin, parts, increments, control, allowed, bounds)
             if potential is None:  # what is not observed has no evidence
                 predicted = predicted._replace(log_scale=-np.log(predicted.values.sum() * predicted.grid.cell))
             update = Update(predicted, report.edges, report.tails, 0.0, False)
@@ -176,8 +183,7 @@ class Prepared:
         self,
         begin: Field,
         parts: list[tuple[float, float]],
-        inside: Array,
-        rates: Array,
+        increments: Increments,
         control: Control,
         allowed: float,
         bounds: Bounds,
@@ -185,7 +191,7 @@ class Prepared:
         fewest: int = 1,
     ) -> tuple[Field, Report, Control]:
         """Return the density at the end of an interval, advanced over its parts by `steppers` in at least `fewest` substeps."""
-        result, report = begin, NOTHING
+        result, report, (inside, rates) = begin, NOTHING, increments
         for start, length in parts:
             observations = self.observations.over(start, length)
             acts, correlated = inside.any() and length > 0, self.correlated and inside.any()

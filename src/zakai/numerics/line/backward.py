@@ -20,6 +20,7 @@ from zakai.numerics.compiled import helper, kernel
 from zakai.numerics.line.averages import AVERAGES, EARLY, LATE, MEAN, MOST_MAGNUS, averaged, averaging, operators
 from zakai.numerics.line.density import circular_moments, highest_of, moments, shifted, spectrum, support, waves
 from zakai.numerics.line.modes import decayed, propagate
+from zakai.numerics.line.resolution import ROUNDING as PRECISION
 from zakai.numerics.line.splitting import STEEPEST, Filtering, differences, residual, split
 from zakai.numerics.line.steps import (
     CONSTANTS_TYPE,
@@ -45,7 +46,6 @@ ROUGH = 0.01  # of the error that an interval may make: what a grid and rounding
 ROUNDING = 1e-15  # of the maximum: smaller values of psi count as this
 SURE = 100.0  # errors of psi from which its small values count
 LEAST = 1e-11  # of the maximum: the same
-NOISE = 4e-16  # rounding of a decomposition relative to the norm of psi
 LOG_MASS, MEAN_AT, VARIANCE, ALIASING, EDGE, ERROR = range(6)  # what is reported of a smoothed density
 
 
@@ -216,7 +216,7 @@ def _decomposed(
         between, decay = spread(b, first, last), decayed(rates, tau)
         propagate(modes, decay, now)
         highest = now[highest_of(now)]
-        noise = NOISE * np.sqrt(norm) * max(1.0, decay[0])
+        noise = PRECISION * np.sqrt(norm) * max(1.0, decay[0])
         left, right, _, _, _, aliasing, _, _, _ = spectrum(now, CUT, SMALLEST, long_cosines, long_sines, False)
         level = max(noise, (ROUNDING + 2.0 * aliasing) * highest)
         # b relative to where its product with the density is largest.

@@ -23,6 +23,7 @@ from zakai.numerics.line.averages import AVERAGES
 from zakai.numerics.line.density import circular_rows, highest_of, moments, separated, shifted, spectrum, support, waves
 from zakai.numerics.line.gaussian_kernels import BAND, convolved, kernel_of
 from zakai.numerics.line.product import WEAK_SHARE, weak_error, weaken
+from zakai.numerics.line.resolution import LEAST_ROUNDING, RELIABLE, SPECTRUM_FACTOR, step_error
 from zakai.numerics.line.splitting import Accuracy, divided
 from zakai.numerics.line.steps import (
     AFTER,
@@ -35,7 +36,6 @@ from zakai.numerics.line.steps import (
     OK,
     PHI,
     RANGE,
-    RELIABLE,
     RESULTS_TYPE,
     SPLIT,
     START_TYPE,
@@ -59,7 +59,6 @@ from zakai.numerics.line.steps import (
     likelihood,
     observation_of,
     product,
-    step_error,
 )
 from zakai.numerics.line.window import ALIGNMENT, CUT
 
@@ -137,7 +136,7 @@ def _loop(kernels: bool, splits: bool, samples: bool, weak: bool, closed: bool) 
             elif splits:
                 accuracy = Accuracy(depth, limits[2] * shares[k], finest)
                 move = divided(now, local, c, averages, spacing, closed, accuracy)
-            if not (move.error < np.inf and move.rounding < max(1e-11, 1e-3 * most)):
+            if not (move.error < np.inf and move.rounding < max(LEAST_ROUNDING, 1e-3 * most)):
                 answer[0], answer[1], answer[2] = float(low), float(high), move.needed
                 status = RANGE if move.needed > 0.0 and not (move.error < np.inf) else FAILED
                 break
@@ -163,7 +162,7 @@ def _loop(kernels: bool, splits: bool, samples: bool, weak: bool, closed: bool) 
                 left, right, answer[0], answer[1], _, aliasing, _, top, _ = spectrum(
                     now, cut, negligible, cosines, sines, not weak
                 )
-                limit = 30.0 * negligible
+                limit = SPECTRUM_FACTOR * negligible
                 if weak:  # of a kink the spectrum falls slowly
                     aliasing, limit = 0.5 * weak_error(now, change), WEAK_SHARE * most
                 else:

@@ -39,6 +39,17 @@ from zakai.numerics.line.grid_choice import (
     weighed,
 )
 from zakai.numerics.line.product import WEAK_SHARE, weak_error
+from zakai.numerics.line.resolution import (
+    EDGE,
+    EDGE_OF_ALIASING,
+    LEAST_ROUNDING,
+    LOST_MASS,
+    RELIABLE,
+    ROUNDING,
+    SPECTRUM_FACTOR,
+    SPECTRUM_SHARE,
+    step_error,
+)
 from zakai.numerics.line.steps import (
     AFTER,
     BROAD,
@@ -47,13 +58,11 @@ from zakai.numerics.line.steps import (
     NARROW,
     OK,
     RANGE,
-    RELIABLE,
     SIZE,
     UNRESOLVED,
     product,
-    step_error,
 )
-from zakai.numerics.line.window import CUT, EDGE, LARGEST
+from zakai.numerics.line.window import CUT, LARGEST
 
 Array = NDArray[Any]
 
@@ -191,7 +200,7 @@ def carried(
     square = 0.0
     for j in range(size):
         square += coefficients[j] * coefficients[j]
-    noise = 4e-16 * np.sqrt(square) * max(1.0, decay[0])
+    noise = ROUNDING * np.sqrt(square) * max(1.0, decay[0])
     propagate(modes, decay, coefficients)
     # Beyond the support there is only rounding, which must not be amplified.
     outside, highest, largest = max(after[first], after[last]), 0.0, 0.0
@@ -353,9 +362,9 @@ def advance(
             aliasing, top = unresolved(propagated, cosine, sine), propagated[highest_of(propagated)]
             on_left = max(abs(propagated[first]), abs(propagated[first + 1]))
             on_right = max(abs(propagated[last]), abs(propagated[last - 1]))
-            edge, bound = 0.0 if closed else max(on_left, on_right) / top, max(EDGE, 4.0 * aliasing)
-            resolved = aliasing <= max(30.0 * negligible, 1e-5 * allowed)
-            if not (aliasing < np.inf and rounding <= max(1e-11, 1e-3 * allowed) and (resolved or not stays)):
+            edge, bound = 0.0 if closed else max(on_left, on_right) / top, max(EDGE, EDGE_OF_ALIASING * aliasing)
+            resolved = aliasing <= max(SPECTRUM_FACTOR * negligible, SPECTRUM_SHARE * allowed)
+            if not (aliasing < np.inf and rounding <= max(LEAST_ROUNDING, 1e-3 * allowed) and (resolved or not stays)):
                 return i, FAILED
             if edge <= bound and resolved:
                 break
@@ -380,7 +389,7 @@ def advance(
             mass += propagated[j]
             if propagated[j] > CUT * top:
                 from_, to = min(from_, j), j
-        if not (abs(mass - 1.0) < 1e-3):
+        if not (abs(mass - 1.0) < LOST_MASS):
             return i, FAILED
         missing = abs(mass - 1.0)
         for j in range(size):
@@ -412,7 +421,7 @@ def advance(
             deeper = np.log(propagated[highest_of(propagated)] * spacing / coarse) - np.log(now[highest_of(now)])
         added, growth, below = product(now, b) if seen else (0.0, 0.0, 0.0)
         on_left, on_right, from_at, to_at, _, unsampled, _, highest, _ = spectrum(now, CUT, negligible, cosines, sines, stays)
-        limit = 30.0 * negligible if seen else np.inf
+        limit = SPECTRUM_FACTOR * negligible if seen else np.inf
         if weak:  # of a kink the spectrum falls slowly
             unsampled, limit = 0.5 * weak_error(now, rows[1]) if seen else 0.0, WEAK_SHARE * allowed
         if np.isnan(added):

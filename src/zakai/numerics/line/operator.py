@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from zakai.numerics.compiled import kernel
 from zakai.numerics.complex_step import is_complex, real_product
+from zakai.numerics.line.resolution import ROUNDING
 
 Array = NDArray[Any]
 
@@ -219,7 +220,7 @@ class Spectral:
             return inner, np.inf
         result = self.scale * self.decayed(inner, length)
         top, growth = float(np.max(result.real)), max(1.0, float(np.exp(-length * self.rates[0])))
-        return result, 4e-16 * reach * growth / top if top > 0 else np.inf
+        return result, ROUNDING * reach * growth / top if top > 0 else np.inf
 
     def decayed(self, inner: Array, length: float) -> Array:
         """Return U exp(-length lambda) U' inner."""

@@ -24,6 +24,7 @@ from zakai.numerics.compiled import kernel
 from zakai.numerics.line import window as lw
 from zakai.numerics.line.density import moments, support
 from zakai.numerics.line.grid_choice import DEPTH, LEVELS, MOST_CELLS
+from zakai.numerics.line.resolution import GROSS
 from zakai.numerics.line.steps import exponent_added
 
 Array = NDArray[Any]
@@ -112,7 +113,7 @@ def multiplied(values: Array, window: lw.Window, likelihood: Likelihood, rough: 
         if not np.isfinite(product.log_mass.real):
             return product
         check = lw.grid_check(product.values, new.closed)
-        noisy = check.rough and check.aliasing < lw.GROSS
+        noisy = check.rough and check.aliasing < GROSS
         if check.aliasing <= 1e-11 or new.size >= (lw.LARGE if noisy else lw.SIZES[-1]):
             break
         before, new = new, finer(product.values, new, check)
@@ -142,21 +143,37 @@ def _product(values: Array, window: lw.Window, new_values: Array, new: lw.Window
         logs = likelihood.of(likelihood.known[1])
     else:
         logs = likelihood.logs(new.points)
-    if np.iscomplexobj(logs) or np.iscomplexobj(new_values):
-        logs, new_values = logs.astype(complex), new_values.astype(complex)
     top_of_density = float(values.real.max()) * new.spacing / window.spacing
-    return Product(*_normalized(np.ascontiguousarray(new_values), np.ascontiguousarray(logs), top_of_density), new)
+    return Product(*normalized(new_values, logs, np.ones(new.size), top_of_density), new)
+
+
+def normalized(density: Array, logs: Array, weights: Array, largest: float) -> tuple[Array, Any, float, float]:
+    """Return the product of a density and a likelihood as probabilities.
+
+    Args:
+        density: at points (N,).
+        logs: the logarithm of the likelihood there (N,).
+        weights: those of the quadrature at the points (N,).
+        largest: the maximum of the density before.
+
+    Returns:
+        The probabilities (N,), the logarithm of their sum before, how deep below `largest` the mass of the product is, and the
+        growth of errors.
+    """
+    if np.iscomplexobj(logs) or np.iscomplexobj(density):
+        logs, density = logs.astype(complex), density.astype(complex)
+    result: tuple[Array, Any, float, float] = _normalized(*map(np.ascontiguousarray, (density, logs, weights)), largest)
+    return result
 
 
 _R, _C = types.float64, types.complex128
 
 
 @kernel(
-    types.Tuple((_R[::1], _R, _R, _R))(_R[::1], _R[::1], _R),  # type: ignore[no-untyped-call]
-    types.Tuple((_C[::1], _C, _R, _R))(_C[::1], _C[::1], _R),  # type: ignore[no-untyped-call]
+    types.Tuple((_R[::1], _R, _R, _R))(_R[::1], _R[::1], _R[::1], _R),  # type: ignore[no-untyped-call]
+    types.Tuple((_C[::1], _C, _R, _R))(_C[::1], _C[::1], _R[::1], _R),  # type: ignore[no-untyped-call]
 )
-def _normalized(values: Array, logs: Array, largest: float) -> tuple[Array, Any, float, float]:
-    """values exp(logs) normalised, the logarithm of its sum, how deep below `largest` its mass is, and the growth of errors."""
+def _normalized(values: Array, logs: Array, weights: Array, largest: float) -> tuple[Array, Any, float, float]:
     size = values.size
     result = np.zeros(size, values.dtype)
     own = np.empty(size)
@@ -170,12 +187,12 @@ def _normalized(values: Array, logs: Array, largest: float) -> tuple[Array, Any,
     for i in range(size):
         if own[i] > -np.inf and logs[i].real > -np.inf:
             # Relative to the largest product: neither factor needs to be a number there.
-            result[i] = values[i] / np.exp(own[i]) * np.exp(own[i] + logs[i] - top)
+            result[i] = weights[i] * (values[i] / np.exp(own[i]) * np.exp(own[i] + logs[i] - top))
             mass += result[i]
     depth, growth, reference = 0.0, 0.0, np.log(largest)
     for i in range(size):
         result[i] /= mass
-        growth += np.exp(min(logs[i].real + reference - top - np.log(mass.real), 80.0))
+        growth += weights[i] * np.exp(min(logs[i].real + reference - top - np.log(mass.real), 80.0))
         if result[i].real > 0:
             depth += result[i].real * (reference - own[i])
     return result, np.log(mass) + top, depth, growth

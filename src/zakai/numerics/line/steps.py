@@ -19,6 +19,7 @@ from zakai.numerics.compiled import helper
 from zakai.numerics.exponentials import exponentiate
 from zakai.numerics.line.density import spectrum
 from zakai.numerics.line.grid_choice import FAR, log_likelihood
+from zakai.numerics.line.resolution import SPECTRUM_FACTOR
 
 Array = NDArray[Any]
 
@@ -28,7 +29,6 @@ COLUMNS = (
 )  # fmt: skip
 # The transition: whole with a sample after it, split with increments inside, whole with increments inside, split with a sample.
 FACTOR, SPLIT, KERNEL, SPLIT_FACTOR = 0, 1, 2, 3
-RELIABLE = 1e-3  # of the promised error: smaller estimates are not reported
 MARGIN = 96  # points of a table of coefficients in time beyond the grid, of which a third may be used before it is made again
 
 
@@ -323,7 +323,7 @@ def checked(
         aliasing = max(aliasing, middle)
     answer[0], answer[1], answer[2] = float(low), float(high), 0.7 * spacing
     status, mass = OK, 0.0
-    if not (aliasing <= 30.0 * negligible):
+    if not (aliasing <= SPECTRUM_FACTOR * negligible):
         status = RANGE if not weak and aliasing < np.inf else FAILED
     elif not (edge <= bound):
         status = RANGE if edge < np.inf else FAILED
@@ -340,24 +340,6 @@ def checked(
             now[j] /= mass
         answer[0], answer[1] = first, last
     return status, mass, aliasing, edge, negative, highest
-
-
-def error_made(aliasing: float, edge: float, negative: float, time: float, amplified: float) -> float:
-    """Return the error of a step, of the mean in standard deviations and of the log-likelihood.
-
-        2 aliasing + 10 (edge + negative) + time + min(amplified, 1)
-
-    Args:
-        aliasing: the spectrum that the grid does not resolve, relative to the mass: both its sides count.
-        edge: the density at the ends of the grid, relative to the maximum: what lies beyond counts with its squared distance.
-        negative: the negative share of the mass, which counts in the same way.
-        time: the errors of the transition in time and of rounding.
-        amplified: the error of small values of the density, times its growth by a sample.
-    """
-    return 2.0 * aliasing + 10.0 * (edge + negative) + time + min(amplified, 1.0)
-
-
-step_error = helper(error_made)
 
 
 @helper

@@ -23,6 +23,7 @@ from scipy.special import ndtr
 from zakai.numerics.compiled import kernel
 from zakai.numerics.complex_step import STEP
 from zakai.numerics.line.operator import DENSE, PART, TERMS, FourierOperator, Spectral, derivatives, exponential_of, quotients
+from zakai.numerics.line.resolution import ROUNDING
 from zakai.numerics.line.window import CUT, SMALL, Window, density_at, gathered, interpolated, local_polynomial
 
 Array = NDArray[Any]
@@ -170,7 +171,7 @@ class Varied(NamedTuple):
         turned = (self.operators * quotients(rates, decay, length)) @ coefficients
         after = U @ (decay * coefficients)
         # Beyond the support there is only rounding, which the scale must not amplify.
-        noise = 4e-16 * np.sqrt(np.sum(inner * inner)) * max(1.0, decay[0])
+        noise = ROUNDING * np.sqrt(np.sum(inner * inner)) * max(1.0, decay[0])
         seen, place = np.flatnonzero(after[margins[0] : len(after) - margins[1]] > noise) + margins[0], np.arange(len(after))
         first, last = seen[[0, -1]] if len(seen) else (np.nan, np.nan)
         scale = np.where((place < first) | (place > last), 0.0, scale if len(seen) else np.nan)

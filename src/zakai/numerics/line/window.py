@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from zakai.numerics.complex_step import angle, is_complex, real_product
 from zakai.numerics.line.density import spectrum, spectrum_of_many, waves
 from zakai.numerics.line.operator import FourierOperator, generator
+from zakai.numerics.line.resolution import NEGLIGIBLE, SPECTRUM_FACTOR
 
 Array = NDArray[Any]
 
@@ -63,10 +64,7 @@ LARGE = 1024  # points of a grid on which matrices propagate messages, and kerne
 CUT = 1e-13  # density relative to its maximum that a new grid must hold
 DEEP = 1e-20  # the same of densities whose small values are accurate
 SMALL = 1e-8  # density relative to its maximum below which its logarithm is interpolated
-NEGLIGIBLE = 1e-13  # spectrum relative to the mass that need not be resolved
 TOGETHER = 256  # points at which values of a large grid are interpolated together
-GROSS = 1e-4  # spectrum at the highest frequencies from which it is that of what a grid does not resolve, not of noise
-EDGE = 1e-11  # density at the outermost points, relative to the maximum, that a grid may cut off
 ALIGNMENT = 8  # centres are at multiples of so many spacings
 
 
@@ -149,7 +147,7 @@ class GridCheck(NamedTuple):
 
     def unresolved(self, negligible: float, noise: float) -> bool:
         """Return whether a finer grid is needed: the spectrum is not negligible, and not that of kinks or noise up to a level."""
-        return self.aliasing > 30.0 * negligible and (self.aliasing > noise or not self.rough)
+        return self.aliasing > SPECTRUM_FACTOR * negligible and (self.aliasing > noise or not self.rough)
 
 
 def grid_check(values: Array, closed: bool, negligible: float = NEGLIGIBLE, cut: float = CUT) -> GridCheck:

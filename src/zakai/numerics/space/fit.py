@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+from numba import boolean, float64, int64, types, void
+from numpy.typing import NDArray
 
 from zakai.numerics.compiled import helper, kernel
 from zakai.numerics.small_matrices import congruence, solve
 from zakai.numerics.space.grid import SIZES
+
+Array = NDArray[Any]
 
 _CORRELATED = 0.6  # correlation above which the axes follow the covariance
 _OPEN, _CLOSED = 0.6, 0.85  # shares of a circle below which an axis is cut open, and above which it is closed
@@ -116,20 +120,66 @@ def _moments(x: Any, logs: Any, least: float, closed: Any, mean: Any, cov: Any) 
             cov[e, d] = cov[d, e]
 
 
+class Weighted(NamedTuple):
+    """The points x (n, J) relative to `start` (n,), with logarithms of densities (J,); those below `least` do not count."""
+
+    x: Array
+    logs: Array
+    start: Array
+    least: float
+
+
+class Previous(NamedTuple):
+    """The basis (n, n) of the grid of the points, which of its axes are closed, and which coordinates are periodic (n,)."""
+
+    basis: Array
+    closed: Array
+    periodic: Array
+
+
+class Rule(NamedTuple):
+    """What a grid must keep.
+
+    `reach` are the deviations to the end of a density, `spacings` those in a deviation, `extra` the share of its width by which
+    it is wider at each end; along an axis there are from `smallest` to `most` points, and about `points` in all.
+    """
+
+    reach: float
+    spacings: float
+    extra: float
+    smallest: int
+    most: int
+    points: float
+
+
+class Fitted(NamedTuple):
+    """What receives the centre (n,), the basis (n, n), the sizes (n,) and which axes are closed (n,)."""
+
+    centre: Array
+    basis: Array
+    sizes: Array
+    closed: Array
+
+
+_V, _M, _B = float64[::1], float64[:, ::1], boolean[::1]
+
+
 @kernel(
-    "void(float64[:, ::1], float64[::1], float64, float64[::1], float64[:, ::1], float64[::1], float64[:, ::1], boolean[::1],"
-    " boolean[::1], float64, float64, float64, int64, int64, float64, float64[::1], float64[:, ::1], int64[::1], boolean[::1])"
-)
-def fit(
-    x: Any, logs: Any, least: float, start: Any, noise: Any, narrowness: Any, previous: Any, was_closed: Any,
-    periodic: Any, reach: float, spacings: float, extra: float, smallest: int, most: int, points: float, centre: Any, basis: Any,
-    sizes: Any, closed: Any,
-) -> None:  # fmt: skip
+    void(
+        types.NamedTuple([_M, _V, _V, float64], Weighted), _M, _V, types.NamedTuple([_M, _B, _B], Previous),
+        types.NamedTuple([float64, float64, float64, int64, int64, float64], Rule),
+        types.NamedTuple([_V, _M, int64[::1], _B], Fitted),
+    )
+)  # fmt: skip
+def fit(weighted: Weighted, noise: Array, narrowness: Array, before: Previous, rule: Rule, fitted: Fitted) -> None:
     """Write the centre, basis, sizes and closed axes of a grid for weighted points with a Gaussian N(0, noise) added.
 
-    The arguments are those of `space_window.fitted_grid`; the points x (n, J) are overwritten, and those with logarithms below
-    `least` do not count.
+    The points are overwritten; for `narrowness` see `window.fitted_grid`.
     """
+    x, logs, start, least = weighted
+    previous, was_closed, periodic = before
+    reach, spacings, extra, smallest, most, points = rule
+    centre, basis, sizes, closed = fitted
     n, count = x.shape
     mean, cov = np.zeros(n), np.empty((n, n))
     for d in range(n):

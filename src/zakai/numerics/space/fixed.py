@@ -18,7 +18,7 @@ from zakai.numerics.space.grid import Grid, filtered, gaussian_response, indices
 from zakai.numerics.space.spline import gather, resampled
 from zakai.numerics.space.survey import Survey, narrowest, survey
 from zakai.numerics.space.transport import Dynamics, moved_points
-from zakai.numerics.space.window import LEAST, Bounds, fitted_grid
+from zakai.numerics.space.window import LEAST, Bounds, Points, fitted_grid
 
 Array = NDArray[Any]
 STEEPEST = 0.6  # largest tau |L|
@@ -155,7 +155,9 @@ def refitted(field: Field, bounds: Bounds) -> Field:
     narrow, _ = narrowest(found, real, bounds.tail)
     used = np.flatnonzero(real > 0.3 * bounds.edge * real.max())
     logs = np.log(real.reshape(-1)[used] / real.max())
-    new = fitted_grid(grid.offsets[used], logs, grid.centre, np.zeros((grid.n, grid.n)), narrow, bounds, grid, MARGIN)
+    new = fitted_grid(
+        Points(grid.offsets[used], logs, grid.centre), np.zeros((grid.n, grid.n)), narrow, bounds, grid, MARGIN
+    )
     values = resampled(field.values, grid, new, bounds.periodic)
     if survey(values, new).tails.max() > max(3 * bounds.tail, found.tails.max()):
         return field

@@ -51,6 +51,14 @@ class Source(NamedTuple):
     log_scale: Any
 
 
+class Move(NamedTuple):
+    """The linearised system, the steps of the characteristics and the target grid of a substep."""
+
+    linear: Linearisation
+    steps: int
+    target: Grid
+
+
 def weighed(values: Array, logs: Array) -> tuple[Array, Any]:
     """Return the values times exp(logs - top), and top, the largest logarithm where there is mass."""
     real = values.real
@@ -120,10 +128,8 @@ def before_motion(
 
 def after_motion(
     source: Source,
-    target: Grid,
+    move: Move,
     dynamics: Dynamics,
-    linear: Linearisation,
-    steps: int,
     times: tuple[float, float],
     potential: Potential | None,
     bounds: Bounds,
@@ -133,14 +139,14 @@ def after_motion(
 
     Args:
         source: the density after the first half.
-        target: the grid of the result.
-        dynamics, linear: the drift and the noise, and the linearised system.
-        steps: Runge-Kutta steps of the characteristics.
+        move: the linearised system, the steps of the characteristics, and the grid of the result.
+        dynamics: the drift and the noise.
         times: the start and the end of the substep.
         potential: the potential.
         bounds: which coordinates are angles.
         begun: a time in between, and the displacement from the end to it.
     """
+    linear, steps, target = move
     moved = characteristics(dynamics, source.grid, target, *times, steps, bounds.periodic, begun)
     factor, log_scale = potential(target, *times, True) if potential else None, source.log_scale
     at = relative_index(target, source.grid, bounds.periodic, moved)

@@ -25,7 +25,7 @@ from zakai.numerics.space.field import (
     refinable,
 )
 from zakai.numerics.space.grid import Grid, filtered
-from zakai.numerics.space.splitting import Potential, Source, after_motion, before_motion
+from zakai.numerics.space.splitting import Move, Potential, Source, after_motion, before_motion
 from zakai.numerics.space.survey import deviations_in_spacings, narrowest, survey
 from zakai.numerics.space.transport import (
     Dynamics,
@@ -34,7 +34,7 @@ from zakai.numerics.space.transport import (
     moved_points,
     steps_needed,
 )
-from zakai.numerics.space.window import LEAST, Bounds, adjusted, enlargement, fitted_grid
+from zakai.numerics.space.window import LEAST, Bounds, Points, adjusted, enlargement, fitted_grid
 
 Array = NDArray[Any]
 SUPPORT = 400  # points that are moved to see where a density goes
@@ -42,14 +42,6 @@ FEW = 64  # points that show how many Runge-Kutta steps a short substep needs
 TRIES = 7
 MARGIN = 0.03  # of the bounds, for a grid of short steps
 MOST_ENLARGED = 8.0  # times its own volume that a grid may need for the noise of a substep
-
-
-class _Move(NamedTuple):
-    """The linearised system, the steps of the characteristics and the target grid of a substep."""
-
-    linear: Linearisation
-    steps: int
-    target: Grid
 
 
 class Substep(NamedTuple):
@@ -108,7 +100,7 @@ class Stepper:
         scale = np.sqrt(variances / np.where(own > 0, own, 1.0))
         return np.asarray(np.where(np.eye(len(mean)) > 0, variances, noise[0] * np.outer(scale, scale)))
 
-    def _moves(self, field: Field, times: tuple[float, ...]) -> list[_Move]:
+    def _moves(self, field: Field, times: tuple[float, ...]) -> list[Move]:
         """Choose the target grids of substeps that follow each other by moving points of the density."""
         grid, real, bounds, dynamics = field.grid, field.values.real, self.bounds, self._deciding()
         found, linears = field.survey(self.bounds), self._linear(field, times)
@@ -119,7 +111,7 @@ class Stepper:
         start, logs = grid.offsets[support], np.log(real.reshape(-1)[support] / real.max())
         tolerance = 0.05 * self.tolerance * np.exp(-0.5 * logs)
         inverse, variances = grid.inverse, np.maximum(np.diagonal(found.cov), 1e-300)
-        moves: list[_Move] = []
+        moves: list[Move] = []
         noise, moved, steps = np.zeros_like(found.cov), np.zeros_like(start), 0
         for (a, b), linear in zip(pairwise(times), linears, strict=True):
             if not steps:
@@ -132,8 +124,8 @@ class Stepper:
             short = np.abs(moved[good] @ inverse.T).max(initial=0.0) < 1.5 and (np.diagonal(noise) / variances).max() < 0.2
             target = grid
             if not (short and holds) and good.any():
-                target = fitted_grid((start + moved)[good], logs[good], grid.centre, noise, narrow, bounds, grid)
-            moves.append(_Move(linear, steps, target))
+                target = fitted_grid(Points((start + moved)[good], logs[good], grid.centre), noise, narrow, bounds, grid)
+            moves.append(Move(linear, steps, target))
         return moves
 
     def _deciding(self) -> Dynamics:
@@ -164,7 +156,7 @@ class Stepper:
         source: Source,
         t0: float,
         t1: float,
-        move: _Move,
+        move: Move,
         potential: Potential | None,
         begun: tuple[float, Array] | None = None,
     ) -> tuple[Field, Array]:
@@ -172,8 +164,7 @@ class Stepper:
 
         `begun` is their displacement from the end to a time in between.
         """
-        dynamics, bounds = self.dynamics, self.bounds
-        return after_motion(source, move.target, dynamics, move.linear, move.steps, (t0, t1), potential, bounds, begun)
+        return after_motion(source, move, self.dynamics, (t0, t1), potential, self.bounds, begun)
 
     def limit(self, field: Field, t0: float, t1: float) -> float:
         """Return the end, at most t1, of the longest substep by whose noise a density can be spread on a few times its grid."""
@@ -185,7 +176,7 @@ class Stepper:
         return t1
 
     def _moved(
-        self, field: Field, t0: float, t1: float, move: _Move, potential: Potential | None, tails: Array
+        self, field: Field, t0: float, t1: float, move: Move, potential: Potential | None, tails: Array
     ) -> tuple[Field, Array, Report]:
         """Return the density after one substep on a grid that fits it, as `_after`, and the errors of the grid.
 
@@ -237,7 +228,7 @@ class Stepper:
     def replayed(self, field: Field, one: Substep) -> Field:
         """Return the density after a substep that was taken, from another one at its start."""
         source = self._before(field, *one.times, one.linear, one.potential)
-        result, _ = self._after(source, *one.times, _Move(one.linear, one.steps, one.end), one.potential)
+        result, _ = self._after(source, *one.times, Move(one.linear, one.steps, one.end), one.potential)
         return positive(result, self.bounds)
 
     def single(self, field: Field, t0: float, t1: float, potential: Potential | None) -> tuple[Field, Report]:
@@ -272,7 +263,7 @@ class Stepper:
             Substep(field, (t0, middle), one.linear, one.steps, potential, half.grid),
             Substep(half, (middle, t1), two.linear, two.steps, potential, fine.grid),
         )
-        whole = _Move(one.linear.then(two.linear), one.steps, fine.grid)
+        whole = Move(one.linear.then(two.linear), one.steps, fine.grid)
         source = self._before(field, t0, t1, whole.linear, potential)
         coarse, _ = self._after(source, t0, t1, whole, potential, (middle, moved))
         fine = positive(fine, self.bounds)

@@ -17,7 +17,7 @@ from zakai.numerics.space.grid import Grid, filtered
 from zakai.numerics.space.resample import refined, triangular_resampled
 from zakai.numerics.space.spline import gather, relative_index, resampled
 from zakai.numerics.space.survey import Survey, deviations_in_spacings, narrowest
-from zakai.numerics.space.window import Bounds, adjusted, fitted_grid, whitened_grid
+from zakai.numerics.space.window import Bounds, Points, adjusted, fitted_grid, whitened_grid
 
 Array = NDArray[Any]
 _STEEP = 4.0  # change of the log-likelihood between neighbours that a grid may have before it is refined
@@ -274,7 +274,7 @@ def _next(product: _Product, bounds: Bounds, sparse: bool, late: bool) -> Grid |
     if bounds.band_limited:
         used = np.flatnonzero(levels >= least)
         return whitened_grid(grid.offsets[used], levels[used], noise, narrow, bounds, grid)
-    new = fitted_grid(grid.offsets, levels, grid.centre, noise, narrow, bounds, grid, least=least)
+    new = fitted_grid(Points(grid.offsets, levels, grid.centre, least), noise, narrow, bounds, grid)
     if product.steep.max() > _STEEP and new.cell > SMALLER * grid.cell:  # of several peaks
         return adjusted(grid, np.zeros(grid.n), np.zeros(grid.n), np.where(product.steep > _STEEP, MOST_REFINED, 1.0), bounds)
     return new

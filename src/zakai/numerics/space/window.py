@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from zakai.numerics.space.fit import fit
+from zakai.numerics.space.fit import Fitted, Previous, Rule, Weighted, fit
 from zakai.numerics.space.grid import Grid, rounded_size
 
 Array = NDArray[Any]
@@ -45,38 +45,43 @@ class Bounds(NamedTuple):
         return math.sqrt(-2 * math.log(self.tail / margin)) / math.pi
 
 
+class Points(NamedTuple):
+    """Points with densities: `offsets` (J, n) from a point `start` (n,) nearby, and logarithms of densities (J,), at most 0.
+
+    Those with logarithms below `least` do not count.
+    """
+
+    offsets: Array
+    logs: Array
+    start: Array
+    least: float = -np.inf
+
+
 def fitted_grid(
-    offsets: Array,
-    logs: Array,
-    start: Array,
-    noise: Array,
-    narrowness: Array,
-    bounds: Bounds,
-    previous: Grid,
-    extra: float = 0.0,
-    least: float = -np.inf,
+    points: Points, noise: Array, narrowness: Array, bounds: Bounds, previous: Grid, extra: float = 0.0
 ) -> Grid:
     """Return a grid for points with a Gaussian N(0, noise) added.
 
     Args:
-        offsets: the points relative to `start` (J, n).
-        logs: logarithms of their densities (J,), at most 0.
-        start: a point nearby (n,).
+        points: the points.
         noise: covariance that is added (n, n).
         narrowness: smallest standard deviation along each axis, in conditional deviations of a Gaussian (n,), at most 1.
         bounds: what the grid must keep.
         previous: the grid of the points; its axes are kept where they still fit.
         extra: share of its width by which the grid is wider at each end.
-        least: smallest logarithm of a point that counts.
     """
+    offsets, logs, start, least = points
     n = len(start)
     centre, basis = np.zeros(n), np.empty((n, n))
     sizes, closed = np.empty(n, np.int64), np.empty(n, bool)
     fit(
-        np.array(offsets.T, order="C"), np.ascontiguousarray(logs), least, start, np.ascontiguousarray(noise), narrowness,
-        np.ascontiguousarray(previous.basis), previous.circles, np.array(bounds.periodic), bounds.reach, bounds.spacings,
-        extra, LEAST[n], bounds.most, POINTS[n], centre, basis, sizes, closed,
-    )  # fmt: skip
+        Weighted(np.array(offsets.T, order="C"), np.ascontiguousarray(logs), start, float(least)),
+        np.ascontiguousarray(noise),
+        narrowness,
+        Previous(np.ascontiguousarray(previous.basis), previous.circles, np.array(bounds.periodic)),
+        Rule(bounds.reach, bounds.spacings, float(extra), LEAST[n], bounds.most, float(POINTS[n])),
+        Fitted(centre, basis, sizes, closed),
+    )
     return Grid(centre, basis, tuple(sizes.tolist()), tuple(closed.tolist()))
 
 
