@@ -32,6 +32,7 @@ TRAIN, GUIDED, BOOTSTRAP = "tensor-train", "guided-particles", "particle filter 
 TOLERANCES, GUIDES, SIZES = (2e-2, 5e-3, 1e-3), (1000, 4000), (1000, 10_000, 100_000)
 LONGEST = 0.05  # substep of the particle filter in NumPy
 SHOWN = (0.2, 0.6, 1.0)  # shares of the record at which a density is drawn
+LABELS = {TRAIN: f"{TRAIN}, by tolerance", GUIDED: f"{GUIDED}, by number", BOOTSTRAP: f"{BOOTSTRAP}, by number"}
 COLOURS = {TRAIN: OURS, GUIDED: TRUTH, BOOTSTRAP: OTHER}
 
 
@@ -235,10 +236,11 @@ def draw(found: dict[str, Track]) -> Any:
         plain(panel)
         for method, colour in COLOURS.items():
             own = [one for one in track.points if one.method == method]
-            panel.plot([one.milliseconds for one in own], [one.error for one in own], "o-", color=colour, label=method)
-            for number, one in enumerate(own):
-                place, below = (one.milliseconds, one.error), 11 * number if method == TRAIN else 0
-                panel.annotate(one.setting, place, (6, 6 - below), textcoords="offset points", fontsize=8, color=colour)
+            panel.plot([one.milliseconds for one in own], [one.error for one in own], "o-", color=colour, label=LABELS[method])
+            for one in own if method != TRAIN else (own[0], own[-1]):
+                place, first = (one.milliseconds, one.error), method == TRAIN and one is own[0]
+                side, offset = ("right", (-6, 4)) if first else ("left", (6, -12 if method == TRAIN else 6))
+                panel.annotate(one.setting, place, offset, textcoords="offset points", fontsize=8, color=colour, ha=side)
         panel.axhline(track.reference, color=INK, linewidth=0.9, linestyle=(0, (4, 2)), label="error of the reference")
         panel.set_xscale("log")
         panel.set_yscale("log")
@@ -246,7 +248,7 @@ def draw(found: dict[str, Track]) -> Any:
         panel.set_title(name, fontsize=10)
         panel.set_xlabel("milliseconds of a core, an observation")
     figure.axes[0].set_ylabel("error of the means, in standard deviations")
-    figure.axes[-1].legend(frameon=False, fontsize=8)
+    figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=4, frameon=False, fontsize=9)
     return figure
 
 
