@@ -40,7 +40,6 @@ from zakai.methods.particles.interval import (
 from zakai.methods.particles.moments import moments_of
 from zakai.methods.particles.programs import Array
 from zakai.methods.particles.state import Control, Prepared, Rule, State
-from zakai.methods.particles.system import System
 from zakai.methods.particles.window import Target, Window, taken
 from zakai.methods.system.escape_of_states import RARE, check_escape
 from zakai.numerics.particles.chunks import over_chunks
@@ -220,8 +219,8 @@ def _step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[Stat
         mean, deviations, cov, own = moments_of(system, cloud.particles, weights)
         found = variances(cloud.genealogy, weights, deviations)
         excess, work, moved, rate = 0.0, work + cost, 1.0, acceptance
-        after = _loss(found.largest, cov, len(weights))
-        floor = (after - _loss(found.means[0], cov, len(weights))) * max(1.0, MOVE_GAIN * after / loss) ** 2
+        remains = _loss(found.largest, cov, len(weights))
+        floor = (remains - _loss(found.means[0], cov, len(weights))) * max(1.0, MOVE_GAIN * remains / loss) ** 2
         doubtful = doubtful or doubtful_move
     spread = np.sqrt(np.maximum(np.diag(cov), 0.0))
     # What the weights say of a coordinate makes a shift of the prediction smaller by the ratio of the variances.
