@@ -40,7 +40,6 @@ from zakai.methods.particles.interval import (
 from zakai.methods.particles.moments import moments_of
 from zakai.methods.particles.programs import Array
 from zakai.methods.particles.state import Control, Prepared, Rule, State
-from zakai.methods.particles.system import System
 from zakai.methods.particles.window import Target, Window, taken
 from zakai.methods.system.escape_of_states import RARE, check_escape
 from zakai.numerics.particles.chunks import over_chunks
@@ -192,7 +191,8 @@ def _step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[Stat
         steps, control = _steps(prepared, interval, values, state, (before, narrow * scale))
         events = with_update(motion.events(interval, steps.scheme, values, before, scale), system, observed)
         done = _advanced(prepared, start, events, observed, number)
-        found_narrow = _narrowing(system, done)
+        after = moments_of(system, done.cloud.particles, np.exp(done.cloud.logs))
+        found_narrow = _narrowing(after.cov, done.deviations)
         if last_turn or steps.error * narrow <= REPEATED * _allowed(control, len(weights)) * found_narrow:
             break
         narrow = found_narrow
@@ -205,7 +205,7 @@ def _step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[Stat
     cloud = cloud._replace(window=cloud.window.appended(motion, events, observed, done.noise, end))
     weights = np.exp(cloud.logs)
     size, largest = effective(weights), float(weights.max())
-    mean, deviations, cov, own = moments_of(system, cloud.particles, weights)
+    mean, deviations, cov, own = after
     found = variances(cloud.genealogy, weights, deviations)
     doubtful = size < TEMPER_BELOW * len(weights) or done.levels > 3
     acceptance, moved = done.acceptance, 0.0
@@ -219,8 +219,8 @@ def _step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[Stat
         mean, deviations, cov, own = moments_of(system, cloud.particles, weights)
         found = variances(cloud.genealogy, weights, deviations)
         excess, work, moved, rate = 0.0, work + cost, 1.0, acceptance
-        after = _loss(found.largest, cov, len(weights))
-        floor = (after - _loss(found.means[0], cov, len(weights))) * max(1.0, MOVE_GAIN * after / loss) ** 2
+        remains = _loss(found.largest, cov, len(weights))
+        floor = (remains - _loss(found.means[0], cov, len(weights))) * max(1.0, MOVE_GAIN * remains / loss) ** 2
         doubtful = doubtful or doubtful_move
     spread = np.sqrt(np.maximum(np.diag(cov), 0.0))
     # What the weights say of a coordinate makes a shift of the prediction smaller by the ratio of the variances.
@@ -378,11 +378,10 @@ class Drawn(NamedTuple):
     gaussian: Any
 
 
-def _narrowing(system: System, done: Advanced) -> float:
+def _narrowing(cov: Array, before: Array) -> float:
     """Return the smallest ratio of the deviations of a state after and before the observation."""
-    cov = moments_of(system, done.cloud.particles, np.exp(done.cloud.logs)).cov
-    wide = done.deviations > 0
-    ratios = np.sqrt(np.maximum(np.diag(cov), 0.0))[wide] / done.deviations[wide]
+    wide = before > 0
+    ratios = np.sqrt(np.maximum(np.diag(cov), 0.0))[wide] / before[wide]
     return float(np.clip(np.nanmin(ratios, initial=1.0), NARROWEST, 1.0))
 
 

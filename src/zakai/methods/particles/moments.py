@@ -15,8 +15,8 @@ def moments(particles: Array, weights: Array, angles: Array) -> tuple[Array, Arr
     """Return the mean (n,), the deviations from it (n, N), and the covariance (n, n); angles have their mean direction."""
     mean = particles @ weights
     if angles.any():
-        resultant = np.exp(1j * particles[angles]) @ weights
-        mean[angles] = np.where(np.abs(resultant) < 1e-9, 0.0, np.angle(resultant))
+        x, y = (function(particles[angles]) @ weights for function in (np.cos, np.sin))
+        mean[angles] = np.where(np.hypot(x, y) < 1e-9, 0.0, np.arctan2(y, x))
     deviations = particles - mean[:, None]
     if angles.any():
         deviations[angles] = wrap(deviations[angles])
@@ -33,6 +33,7 @@ class Moments(NamedTuple):
 
 
 def moments_of(system: System, particles: Array, weights: Array) -> Moments:
+    """Return the moments of weighted particles of a system."""
     mean, deviations, cov = moments(particles, weights, system.angles)
     n, spread = system.model.n, np.sqrt(np.maximum(np.diag(cov), 0.0))
     return Moments(mean, deviations[:n], system.widened(mean, cov[:n, :n]), spread)
