@@ -27,9 +27,8 @@ import numpy as np
 from zakai.densities import Density, ParticleDensity
 from zakai.densities._values import wrap
 from zakai.methods._protocol import Backward, Info
-from zakai.methods.frame.build import Builder
 from zakai.methods.frame.chain import Chain
-from zakai.methods.frame.filter import GAIN, WITHIN, direction_of, predicted
+from zakai.methods.frame.filter import GAIN, WITHIN, builder_of, direction_of, error_of, predicted
 from zakai.methods.frame.filter import density as filtered_density
 from zakai.methods.frame.moves import Led
 from zakai.methods.frame.state import Prepared, State, Unresolved
@@ -86,7 +85,7 @@ def begin(prepared: Prepared, state: State, count: int, seed: int) -> Message:
     found = drawn_before(u, np.full(n, np.inf), nothing, rng.random((2 * n, count)))
     draws = np.where(found.exists, u.grid.x_of(found.z), np.nan)
     moments = None if prepared.system.base.angles.any() else Moments(*u.moments(), np.zeros((n, count)))
-    return Message(_wrapped(prepared, draws), moments, state.control.error, 0.0, True, seed)
+    return Message(_wrapped(prepared, draws), moments, error_of(prepared, state), 0.0, True, seed)
 
 
 def _generator(interval: int, seed: int) -> np.random.Generator:
@@ -102,7 +101,7 @@ def step(prepared: Prepared, k: int, later: Message, values: Array, state: State
     control = state.control
     if not np.isfinite(later.draws).all():  # the density was lost
         return later._replace(last=False, unknown=0.0)
-    chain = Chain(prepared, prepared.interval(k), values, Builder(prepared, remembered=control.kept))
+    chain = Chain(prepared, prepared.interval(k), values, builder_of(prepared, state))
     rng, x, moments, unknown = _generator(control.interval, later.seed), later.draws, later.moments, 0.0
     try:
         prediction, _, time = predicted(chain, state)
@@ -118,7 +117,7 @@ def step(prepared: Prepared, k: int, later: Message, values: Array, state: State
     off_grid = sum(report.off_grid for report in chain.builder.reports)
     # The draws go by the finer substeps alone, which have GAIN / 3 times the error of what is extrapolated.
     made = 0.5 * (off_grid + prediction.defect + GAIN / 3.0 * time.error)
-    return Message(_wrapped(prepared, x), moments, max(control.error, later.error, made), unknown, False, later.seed)
+    return Message(_wrapped(prepared, x), moments, max(error_of(prepared, state), later.error, made), unknown, False, later.seed)
 
 
 def smoothed(prepared: Prepared, state: State, later: Message) -> tuple[Message, Info]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import NamedTuple
@@ -20,8 +19,8 @@ CONTROLS = 600  # with 96 the tails of a skewed density of three states were nev
 CLOUD = 1024
 # The error of a mean is 1 to 3 times the relative error of the builds, with the control points that happened to be drawn
 # (bearings, turns, re-entry; rms over times and coordinates): the builds have half of the tolerance.
-SHARE, CORES = 0.5, 0.25
-USUAL, LEAST_FORGOTTEN = 0.6, 0.1  # sqrt(1 - share^2) of a radar track, for which the share above was chosen; the least
+SHARE, CORES = 0.5, 0.1
+LEAST = 0.4  # of the tolerance that earlier errors may leave
 EDGE = 0.3  # share of the tolerance that may be near an end of an axis
 ROUGH = 4.0  # tolerances of error off the grid, above which the grid is made finer
 WIDER = 0.25  # share of a box that is added at both ends of an axis with mass there
@@ -44,14 +43,14 @@ class Report(NamedTuple):
 class Builder:
     """Builds densities for one step, and keeps the reports of all builds.
 
-    The errors of the builds of an interval add up: each has a `share` of its tolerance.  So do those of the intervals of which
-    the data leaves the share `remembered` each.
+    The errors of the builds of an interval add up: each has a `share` of its tolerance.  So do those of intervals where the data
+    leaves them: the `error` of the mean at the start, in deviations, lowers the tolerance.
     """
 
     prepared: Prepared
+    error: float = 0.0
     reports: list[Report] = field(default_factory=list)
     share: float = 1.0
-    remembered: float = 0.0
 
     def for_substeps(self, count: int) -> None:
         """Set the share for an interval of so many substeps, of which one has two builds."""
@@ -59,9 +58,9 @@ class Builder:
 
     @property
     def _tolerance(self) -> float:
-        """The error of a build: errors of the intervals that are remembered add up as their squares do."""
-        forgotten = math.sqrt(max(1.0 - self.remembered**2, LEAST_FORGOTTEN**2))
-        return SHARE * self.share * min(1.0, forgotten / USUAL) * self.prepared.tolerance
+        """The error of a build."""
+        tolerance = self.prepared.tolerance
+        return SHARE * self.share * tolerance * min(1.0, max(tolerance / max(self.error, 1e-300), LEAST))
 
     @property
     def rule(self) -> Rule:

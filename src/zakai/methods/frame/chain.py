@@ -41,12 +41,16 @@ ALONE = 1e-9  # off-diagonal noise in a frame that needs no correction
 
 @dataclass
 class Prediction:
-    """A density before an observation, as a function; points of it; the logarithm of its mass, and the mass that was lost."""
+    """A density before an observation, as a function, with points of it.
+
+    `log_mass` is the logarithm of its mass, `defect` the mass that was lost, `slope` (n, n) the linearised motion.
+    """
 
     function: Carried
     mass: Mass
     log_mass: float
     defect: float
+    slope: Array
 
     @property
     def log_scale(self) -> float:
@@ -63,19 +67,23 @@ class Chain:
     values: Array
     builder: Builder
     moves: list[Move] = field(default_factory=list)
+    _slope: Array = field(init=False)
 
     def _carried(self, u: Train, t0: float, t1: float) -> tuple[Carried, Mass]:
-        """Return a density after the flow from t0 to t1 as a function, and points of it."""
+        """Return a density after the flow from t0 to t1 as a function, and points of it; note the linearised motion."""
         prepared, motion = self.prepared, self.prepared.motion
         points, weights = u.cloud(CLOUD)
         steps = motion.steps(self.interval, points, (t0, t1), self.values, 0.1 * self.builder.rule.tolerance)
         ends, logs = motion.ends(points, motion.path(self.interval, t0, t1, self.values, steps))
         finite = np.isfinite(ends).all(axis=0) & np.isfinite(logs)
         if not finite.all():
-            ends, logs, weights = ends[:, finite], logs[finite], weights[finite]
+            points, ends, logs, weights = points[:, finite], ends[:, finite], logs[finite], weights[finite]
         if not weights.sum() > 0:
             raise Unresolved(f"no part of the density is finite after the drift from t = {t0:g} to {t1:g}")
         mass, top = Mass(ends, weights / weights.sum()), 0.0
+        angles = prepared.system.base.angles
+        before = Mass(points, mass.weights).unwrapped(angles)
+        self._slope = before.slope(mass.unwrapped(angles).points) @ self._slope
         if prepared.system.weighted:
             top = float(logs.max())
             mass = mass.reweighted(logs)
@@ -149,8 +157,9 @@ class Chain:
         """Return the prediction by so many substeps; Unresolved where the density is lost."""
         start, stop = self.interval.start, self.interval.stop
         self.moves = []
+        self._slope = np.eye(self.prepared.model.n)
         if stop <= start:
-            return Prediction(*self._carried(u, start, stop), 0.0, 0.0)
+            return Prediction(*self._carried(u, start, stop), 0.0, 0.0, self._slope)
         self.builder.for_substeps(count)
         length, at, log_mass, defect = (stop - start) / count, start, 0.0, 0.0
         for j in range(count):
@@ -158,7 +167,7 @@ class Chain:
             u, gained, lost = self._middle(u, at, middle, length)
             log_mass, defect, at = log_mass + gained, defect + lost, middle
         function, mass = self._carried(u, at, stop)
-        return Prediction(function, mass, log_mass, defect)
+        return Prediction(function, mass, log_mass, defect, self._slope)
 
     def first(self, u: Train, count: int) -> tuple[Prediction, int]:
         """Return the prediction by the fewest substeps, `count` or more, that keep the mass, and their number."""

@@ -33,6 +33,9 @@ AUDIT = 10  # intervals between comparisons of s and 2 s substeps, where the las
 TIME_SHARE, GAIN, ACCEPTED, SAFETY = 1.0, 4.0, 8.0, 0.7
 IN_TAILS = 0.03  # error of a mean over tolerance e^depth: linear tracks with observations 4 and 6 deviations away
 BEYOND = 0.3  # error of a mean over the distance of an observation, where a Gaussian stands for the tails
+# Error of a mean over the error of a build in L1: those of different builds have different signs.
+OF_MEAN = 0.7
+OF_TAILS = 0.25  # growth of the logarithm of a relative error with the depth, on wide tracks seen by bearings
 WITHIN = 3.0  # tolerances that the error of a mean may reach
 FIGURES = (
     "error_estimate", "tolerance_ratio", "rank", "mass_defect", "off_grid_error", "edge_mass", "tail_depth", "powers",
@@ -54,7 +57,8 @@ def init(prepared: Prepared, prior: Any) -> State:
     v, _ = builder.build(function, mass)
     assert model.n == len(mass.points) and len(theta) == len(prepared.theta)
     report = builder.reports[-1]
-    control = Control(0, Substeps(0.0, -AUDIT, False, 0.0), 0.5 * report.off_grid, 0.0)
+    _, P = mass.unwrapped(system.base.angles).moments()
+    control = Control(0, Substeps(0.0, -AUDIT, False, 0.0), (OF_MEAN * report.off_grid) ** 2 * P)
     return State.of(v.scaled(1.0 / v.mass), control)
 
 
@@ -163,7 +167,7 @@ def step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[State
 
 def _step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[State, Info]:
     interval, control = prepared.interval(k), state.control
-    builder = Builder(prepared, remembered=control.kept)
+    builder = builder_of(prepared, state)
     prediction, count, time = predicted(Chain(prepared, interval, values, builder), state)
     updated = update(builder, prediction, prepared.motion.likelihood(interval, values))
     v, rule = updated.density, builder.rule
@@ -171,12 +175,13 @@ def _step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[Stat
     depth = depth_of(updated.prediction, prediction.mass, v)
     reports = builder.reports
     off_grid, edge = sum(report.off_grid for report in reports), max(report.edge for report in reports)
-    # Errors of different builds have different signs; the error of a mean is about half of the error in L1 at most.
-    kept = _kept(prediction, prepared, cov)
-    error = math.hypot(kept * control.error, 0.5 * (off_grid + prediction.defect + edge + time.error))
     # Far out a density is known relative to its largest value only; beyond, a Gaussian stands for it.
     far = min(IN_TAILS * rule.tolerance * math.exp(min(depth, 50.0)), BEYOND * math.sqrt(2.0 * max(depth, 0.0)))
-    error = math.hypot(error, far)
+    new = math.hypot(OF_MEAN * (off_grid + prediction.defect + edge + time.error), far)
+    # Where an observation leads into the tails, the relative errors of earlier builds are larger.
+    larger = math.exp(2.0 * OF_TAILS * min(max(depth, 0.0), 50.0))
+    errors = larger * _carried_error(control.error, prediction, prepared, cov) + new**2 * cov
+    error = _in_deviations(errors, cov)
     health = {
         "error_estimate": error,
         "tolerance_ratio": error / (WITHIN * prepared.tolerance),
@@ -190,9 +195,17 @@ def _step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[Stat
         "time_error": time.error,
         "effective_share": updated.effective,
     }
-    number = control.interval + 1
-    moved = Control(number, time, error, 0.8 * control.kept + 0.2 * kept if number > 1 else kept)
-    return State.of(v, moved), Info(updated.log_evidence, mean, cov, health)
+    return State.of(v, Control(control.interval + 1, time, errors)), Info(updated.log_evidence, mean, cov, health)
+
+
+def error_of(prepared: Prepared, state: State) -> float:
+    """Return the estimated error of the mean of a state, in standard deviations."""
+    return _in_deviations(state.control.error, state.train(prepared.system.periods).moments()[1])
+
+
+def builder_of(prepared: Prepared, state: State) -> Builder:
+    """Return what builds the densities of the interval that follows on a state."""
+    return Builder(prepared, error_of(prepared, state))
 
 
 def predicted(chain: Chain, state: State) -> tuple[Prediction, int, Substeps]:
@@ -208,13 +221,22 @@ def predicted(chain: Chain, state: State) -> tuple[Prediction, int, Substeps]:
     return prediction, count, time
 
 
-def _kept(prediction: Prediction, prepared: Prepared, cov: Array) -> float:
-    """Return the share of an earlier error that an observation leaves: the ratio of the deviations, as a geometric mean."""
+def _carried_error(error: Array, prediction: Prediction, prepared: Prepared, cov: Array) -> Array:
+    """Return what a motion and an observation leave of an error of the mean, as covariances (n, n).
+
+    An observation does not change the ratio of a wrong density to the right one.  Where its logarithm is c'x the mean is off by
+    P c, before and after with the covariance P of that time.
+    """
     _, P = prediction.mass.unwrapped(prepared.system.base.angles).moments()
-    before, after = np.linalg.slogdet(P), np.linalg.slogdet(cov)
-    if before[0] <= 0 or after[0] <= 0:
-        return 1.0
-    return float(min(1.0, math.exp(0.5 * (after[1] - before[1]) / len(cov))))
+    scale = np.maximum(np.sqrt(np.diag(P)), 1e-300)
+    unit = P / np.outer(scale, scale) + 1e-9 * np.eye(len(P))
+    left = np.linalg.solve(unit, (cov / scale).T).T / scale @ prediction.slope
+    return np.asarray(left @ error @ left.T)
+
+
+def _in_deviations(error: Array, cov: Array) -> float:
+    """Return the largest error of a mean in standard deviations, of covariances (n, n)."""
+    return float(np.sqrt(np.max(np.diag(error) / np.maximum(np.diag(cov), 1e-300))))
 
 
 def _audited(chain: Chain, u: Train, coarser: Prediction, count: int, number: int) -> tuple[Prediction, int, Substeps]:
@@ -235,4 +257,4 @@ def _audited(chain: Chain, u: Train, coarser: Prediction, count: int, number: in
     extrapolate = plain > 3.0 * both
     found = Substeps((both if extrapolate else plain) / length, number, extrapolate, error / GAIN)
     extra = extrapolated(finer, coarser)
-    return Prediction(extra, finer.mass, finer.log_mass, finer.defect), more, found
+    return Prediction(extra, finer.mass, finer.log_mass, finer.defect, finer.slope), more, found

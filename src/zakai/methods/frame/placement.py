@@ -43,6 +43,15 @@ class Mass(NamedTuple):
         apart = self.points - mean[:, None]
         return mean, (apart * self.weights) @ apart.T
 
+    def slope(self, ends: Array) -> Array:
+        """Return the matrix (n, n) of the linear regression of other points (n, P), with the same weights, on these."""
+        mean, P = self.moments()
+        scale = np.maximum(np.sqrt(np.diag(P)), 1e-300)
+        apart = (self.points - mean[:, None]) / scale[:, None]
+        moved = ends - (ends @ self.weights)[:, None]
+        unit = P / np.outer(scale, scale) + 1e-9 * np.eye(len(P))
+        return np.asarray(np.linalg.solve(unit, (apart * self.weights) @ moved.T).T / scale)
+
     def reweighted(self, logs: Array) -> Mass:
         """Return the points with weights times the exponentials of numbers (P,)."""
         weights = self.weights * np.exp(logs - logs.max())

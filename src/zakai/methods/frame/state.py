@@ -36,14 +36,12 @@ class Substeps(NamedTuple):
 class Control(NamedTuple):
     """What decides the next step beside the density.
 
-    The number of intervals, the substeps, the estimate of the error of the mean in standard deviations, and the share of an error
-    that an observation leaves, a mean over the last ones.
+    The number of intervals, the substeps, and the estimated error of the mean, as a covariance (n, n).
     """
 
     interval: int
     time: Substeps
-    error: float
-    kept: float
+    error: Array
 
 
 class State(NamedTuple):

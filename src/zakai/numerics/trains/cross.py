@@ -36,7 +36,7 @@ class Options(NamedTuple):
 
     tolerance: float
     most_rank: int
-    enough: float = 8.0
+    enough: float = 4.0
 
 
 class Built(NamedTuple):

@@ -33,6 +33,11 @@ TERM = types.Tuple((TRAIN, F1, PROGRAM, BOX, PATH))
 # The law, its given numbers, which terms count, and [time, power, top]; no term counts: no likelihood.
 LAW = types.Tuple((PROGRAM, F1, F1, F1))
 LARGEST_LOG = 500.0  # of a factor; the exponential of more is cut
+# Later observations lead into what are tails now, where an error relative to the density becomes one of the mean.  With the power
+# 1/2 of the sums (the scaling of correspondence analysis) the error of a skeleton is relative to the density, as an average over
+# its mass.  On fourteen wide tracks seen by bearings .4 had a quarter of the error of no scaling, for 1.15 times the evaluations.
+# Rows below the share `DEEPEST` of the largest count less, or ranks grow with what is noise.
+POWER, DEEPEST = 0.4, 0.01
 
 
 @kernel(types.void(PROGRAM, BOX, PATH, F2, F2))
@@ -197,11 +202,22 @@ def fibre_points(left: Array, axis: Array, right: Array, out: Array) -> None:
                     p += 1
 
 
+@helper
+def _to_factors(sums: Array) -> None:
+    """Replace sums of rows or columns by the factors of these."""
+    top = 0.0
+    for p in range(sums.size):
+        top = max(top, sums[p])
+    for p in range(sums.size):
+        sums[p] = max(sums[p] / top, DEEPEST) ** -POWER if top > 0.0 else 1.0
+
+
 @kernel(types.int64(F2, types.float64, types.int64, I1, I1, F2), reordered=True)
 def skeleton(A: Array, tolerance: float, most: int, rows: Array, columns: Array, out: Array) -> int:
     """Write rows of A (m, b) whose span interpolates it, and return their number r.
 
-    Pivoted Gram-Schmidt to a relative error in the Frobenius norm, then rows of nearly maximal volume.
+    Pivoted Gram-Schmidt to a relative error in the Frobenius norm, then rows of nearly maximal volume, both for A with rows and
+    columns divided by powers of their sums: see `POWER`.
 
     Args:
         A: the matrix.
@@ -214,11 +230,18 @@ def skeleton(A: Array, tolerance: float, most: int, rows: Array, columns: Array,
     m, b = A.shape
     most = min(most, b, m)
     Q, rest, norms, total = np.empty((most, m)), np.empty((b, m)), np.empty(b), 0.0
+    of_row, of_column = np.zeros(m), np.zeros(b)
+    for p in range(m):
+        for q in range(b):
+            of_row[p] += abs(A[p, q])
+            of_column[q] += abs(A[p, q])
+    _to_factors(of_row)
+    _to_factors(of_column)
     for q in range(b):
         norms[q] = 0.0
         for p in range(m):
-            rest[q, p] = A[p, q]
-            norms[q] += A[p, q] * A[p, q]
+            rest[q, p] = A[p, q] * of_row[p] * of_column[q]
+            norms[q] += rest[q, p] * rest[q, p]
         total += norms[q]
     r = 0
     while r < most:
@@ -287,6 +310,9 @@ def skeleton(A: Array, tolerance: float, most: int, rows: Array, columns: Array,
                 for q in range(r):
                     C[p, q] -= f * row[q]
         rows[j] = i
+    for p in range(m):
+        for q in range(r):
+            C[p, q] *= of_row[rows[q]] / of_row[p]
     return r
 
 
