@@ -2,16 +2,15 @@
 
     python benchmarks/choices.py [NAME ...] [--methods auto yau-yau] [--limit 60] [--judge 100000]
 
-Each line is one system and one method in a process of its own with a limit of processor seconds: the method that ran, the seconds
-of a second call of the first rows and of the record, the root mean square of the errors of means in posterior standard
-deviations, the difference of the log-likelihood, and the number of warnings.  The judge is the mean of two runs of
-`guided-particles` with many particles and other seeds; `judge` is half of their distance.
+Each line is one system and one method in a process of its own with a limit of processor seconds: the method that ran, its seconds
+with the loading of kernels, the root mean square of the errors of means in posterior standard deviations, the difference of the
+log-likelihood, and the warnings.  The judge is the mean of two runs of `guided-particles` with many particles and other seeds, kept
+in the folder for temporary files; `judge` is half of their distance.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import resource
 import subprocess
@@ -93,7 +92,7 @@ def main() -> None:
     parser.add_argument("--methods", nargs="*", default=["auto"])
     parser.add_argument("--limit", type=int, default=60)
     parser.add_argument("--judge", type=int, default=100_000)
-    parser.add_argument("--one", help=json.dumps("name and method of one line, in this process"))
+    parser.add_argument("--one", help="NAME:METHOD of one line, in this process")
     args = parser.parse_args()
     if args.one:
         name, method = args.one.split(":")

@@ -81,14 +81,14 @@ def test_a_kernel_that_is_compiled_is_completed():
 
 
 def test_the_time_in_which_kernels_are_compiled_does_not_end_the_measurement():
+    loop = "    for k in range(9):\n        y += np.sin(y) / (k + y * y)\n"
     names: dict[str, Any] = {"np": np}
-    exec("def inner(x):\n    y = x\n" + 60 * "    y += np.sin(y) / (3.0 + y * y)\n" + "    return y\n", names)
+    exec("def inner(x):\n    y = x\n" + 40 * loop + "    return y\n", names)  # without a file, so that it is compiled
     compiled: Any = kernel(float64(float64))(names["inner"])
     before = compilation_time()
-    with expected_time._at_most(0.05):
-        assert np.isfinite(compiled(1.0))
-        assert compilation_time() - before > 0.05
-        time.sleep(0.02)
+    with expected_time._at_most(0.4):
+        compiled(1.0)
+    assert compilation_time() - before > 0.4
 
 
 def test_blocks_add_their_times_and_the_record_is_not_filtered_as_a_whole(monkeypatch):

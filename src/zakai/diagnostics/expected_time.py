@@ -79,17 +79,17 @@ def expected_seconds(model: Model, record: Record, method: str = "auto", *, most
 def _of_block(setting: Setting, schedule: Schedule, values: np.ndarray, most: float) -> Expected:
     """Return the time of one method for all intervals."""
     count = len(schedule)
-    found = _Measured(ENOUGH)
+    found, before = _Measured(ENOUGH), _Measured(LOADED)
     try:
         with _at_most(most):
             found.preparing, each = _preparation(setting, schedule)
             rows = int(np.clip(ENOUGH / max(each, 1e-9), min(MORE, count), min(MOST, count)))
             prepared = _prepare(setting, schedule.part(slice(0, rows)))
-            _measure(setting, prepared, values[: min(MORE, rows)], _Measured(LOADED))  # loads kernels
+            _measure(setting, prepared, values[: min(MORE, rows)], before)  # loads kernels
             _measure(setting, prepared, values[:rows], found)
     except _LateError:
         pass
-    times = found.times
+    times = found.times or before.times[1:]  # the first of those before waits for what is made once
     if not times:
         return Expected(max(most * count, found.preparing), True)
     # A filter adapts to the first observations.
