@@ -1,7 +1,7 @@
 """Systems of two to eight states on which particles are measured.
 
-How often the past is moved was chosen on bearings, turn, falling and chain; the rule that leaves moves out and the smallest
-number of particles also on pendulums, volatility and reactor.  The others took no part in any choice.
+When the past is moved was chosen on bearings, turn, predator, volatility, robot and pendulums; the smallest number of particles
+also on the reactor.  The others took no part in any choice.
 """
 
 from __future__ import annotations

@@ -84,6 +84,30 @@ def test_moves_of_the_past_keep_a_parameter_without_noise_known():
     assert np.abs((result.mean - exact.mean) / np.sqrt(exact.variance))[1:].max() < 0.2
 
 
+def test_the_past_is_left_alone_where_the_state_forgets_it():
+    model = zakai.Model(
+        state=["x"], drift=["-4*x - x**3"], diffusion=[["1"]], observation=["x"], observation_kind="samples",
+        observation_noise=[["0.1"]], prior={"kind": "gaussian", "mean": [0.0], "cov": [0.1]},
+    )  # fmt: skip
+    result = zakai.filter(model, record_of(model, 40, 0.5, gaps=False), PARTICLES, particles=1000, keep="moments")
+    assert np.nansum(result.health["moved"]) == 0
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_an_observation_that_says_nothing_of_the_noise_only_weighs_the_particles():
+    # The state is wide and its noise is not: draws of the noise cannot help, and powers of the likelihood only cost time.
+    model = zakai.Model(
+        state=["x", "y"], drift=["-x", "-y"], diffusion=[["1e-3", "0"], ["0", "1e-3"]], observation=["x", "y"],
+        observation_kind="samples", observation_noise=[["0.01", "0"], ["0", "0.01"]],
+        prior={"kind": "mixture", "weights": [0.5, 0.5], "means": [[-1, 0], [1, 0]], "covs": [[0.5, 0.5], [0.5, 0.5]]},
+    )  # fmt: skip
+    record = zakai.Record([0.1, 0.2], [[0.5, 0.2], [0.4, 0.2]], "samples")
+    result, exact = zakai.filter(model, record, PARTICLES, particles=8000), zakai.filter(model, record, "gaussian-sum")
+    assert np.nanmin(result.health["effective_sample_size"]) < 0.1 * 8000
+    assert np.nansum(result.health["tempering_levels"]) == 0 and np.nansum(result.health["guided"]) == 0
+    assert abs(result.log_likelihood - exact.log_likelihood) < 4 * result.log_likelihood_standard_error
+
+
 def test_an_observation_far_from_the_prediction_is_reached():
     model = zakai.Model(**{**LINEAR["samples"], "observation_noise": [["1e-4", "0"], ["0", "1e-4"]]})
     record = zakai.Record([0.3, 0.6, 0.9], [[3.5, 5.0], [2.0, 1.0], [1.2, -1.0]], "samples")

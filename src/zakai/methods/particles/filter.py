@@ -134,7 +134,8 @@ class Advanced(NamedTuple):
 
     `gained` is the increment of the log-likelihood, `noise` (D, N) that of the interval, `predicted` (n',) the spread of the
     coordinates before the weights of the observation act, `deviations` (n,) those of the states before it, `acceptance` that of
-    moves between powers of the likelihood; the last one is the share of the particles that left every bounded set.
+    moves between powers of the likelihood; `lost` is the share of the particles that left every bounded set, and `unseen` says that
+    few particles are left by an observation that says nothing of the noise.
     """
 
     cloud: Cloud
@@ -146,6 +147,7 @@ class Advanced(NamedTuple):
     guided: bool = False
     acceptance: float = np.nan
     lost: float = 0.0
+    unseen: bool = False
 
 
 def step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[State, Info]:
@@ -210,6 +212,8 @@ def _step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[Stat
     doubtful = size < TEMPER_BELOW * len(weights) or done.levels > 3
     acceptance, moved = done.acceptance, 0.0
     loss, own_loss = (_loss(part, cov, len(weights)) for part in (found.largest, found.means[0]))
+    if done.unseen:  # what is lost now does not come back by the noise of later intervals
+        own_loss = min(own_loss, 1.0)
     floor, excess = FORGOTTEN * control.floor, control.excess + max(loss - own_loss - control.floor, 0.0)
     losses, work, rate = control.losses + loss, control.work + STEP_WORK + len(done.noise), control.rate
     cost = cloud.window.width * (1.0 + MOVE_CONTROL[1] / max(rate, LEAST_RATE))
@@ -357,7 +361,7 @@ def _advanced(prepared: Prepared, cloud: Cloud, events: Events, observed: Observ
     first = np.concatenate([cloud.window.first, noise]) if moving else noise
     gaussian = _linearised(target, cloud, plain)
     if gaussian is not None and not moving and not np.isinf(top) and _uninformed(gaussian, 1.0):
-        return plain  # moves of noise of which the observation says nothing would be of no use
+        return plain._replace(unseen=True)  # moves of noise of which the observation says nothing would be of no use
     best = (gaussian and _guided(prepared, target, cloud, plain, gaussian, number)) or Drawn(plain, first, logs, None)
     size = effective(np.exp(best.after.cloud.logs)) if np.isfinite(best.after.gained) else 0.0
     if size >= min(TEMPER_BELOW * count, TEMPER_FLOOR) or not np.isfinite(best.logs).any():
