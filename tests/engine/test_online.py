@@ -285,3 +285,26 @@ def test_a_density_that_moves_far_is_the_same_to_the_bit_online():
     result, online = zakai.filter(model, record), zakai.online(model)
     found = [online.update(*pair).mean for pair in zip(record.times, record.values, strict=True)]
     assert np.array_equal(found, result.mean[1:])
+
+
+@pytest.mark.parametrize(
+    ("keys", "method"),
+    [
+        (dict(drift=["x - x**3 + sin(t)"], observation=["x**3"], observation_kind="path"), "yau-yau"),
+        (dict(drift=["x - x**3 + sin(t)"], observation=["x", "abs(x)"], observation_kind="samples"), "yau-yau"),
+        (dict(drift=["sin(x + t)"], observation=["x"], observation_kind="increments", cross_noise=[["1/10"]]), "yau-yau"),
+        (dict(drift=["t*x/40"], observation=["x*sin(x)", "x*cos(x)"], observation_kind="increments"), "limited-direct"),
+        (dict(drift=["tanh(x)"], observation=["x + t"], observation_kind="path"), "limited-direct"),
+        (dict(drift=["-x + sin(t)"], observation=["x**2"], observation_kind="samples"), "limited-direct"),
+    ],
+)
+def test_one_interval_after_the_other_is_prepared_as_those_of_a_record_to_the_bit(keys, method):
+    noise = [["1/9" if i == j else "0" for j in range(len(keys["observation"]))] for i in range(len(keys["observation"]))]
+    prior = {"kind": "gaussian", "mean": [0.3], "cov": [[0.5]]}
+    model = zakai.Model(state=["x"], observation_noise=noise, prior=prior, **keys)
+    record = simulated(model, IRREGULAR[:12], gaps=[(3, 0), (4, 0), (9, 0)])
+    whole, online = zakai.filter(model, record, method), zakai.online(model, method)
+    for k, estimate in enumerate(estimates_of(online, record), 1):
+        assert estimate.mean == whole.mean[k] and estimate.cov == whole.cov[k]
+        assert estimate.log_likelihood_increment == whole.log_likelihood_increments[k]
+        assert estimate.health == {name: figures[k] for name, figures in whole.health.items()}

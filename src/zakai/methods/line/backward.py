@@ -26,7 +26,6 @@ from zakai.methods.line.paths import draw
 from zakai.methods.line.prepared import Parts, Prepared, State, cut
 from zakai.methods.line.update import acting_inside, factor_of, state_moments, state_of
 from zakai.numerics.line import window as lw
-from zakai.numerics.line.backward import SMALLEST
 from zakai.numerics.line.density import support
 
 Array = Any
@@ -58,7 +57,7 @@ def _product(state: State, later: Message) -> _Product:
     logs = np.where(density > 0, np.log(density) + later.at(finer.offsets), -np.inf)
     top = float(np.max(logs))
     values = np.exp(logs - top)
-    first, last = support(values, SMALLEST)
+    first, last = support(values, lw.CUT)
     values[:first], values[last + 1 :] = 0.0, 0.0
     total = float(np.sum(values))
     return _Product(values / total, finer, float(np.log(total)) + top)

@@ -25,7 +25,7 @@ from zakai.numerics.line import window as lw
 from zakai.numerics.line.backward import EXCURSION, FEWEST, ROUNDING
 from zakai.numerics.line.density import support
 from zakai.numerics.line.resolution import ROUNDING as PRECISION
-from zakai.numerics.line.resolution import SPECTRUM_FACTOR
+from zakai.numerics.line.resolution import SMOOTHER_SHARE, SPECTRUM_FACTOR
 from zakai.numerics.line.window import local_polynomial
 
 Array = Any
@@ -87,7 +87,6 @@ def _transposed(
 RESOLVED = 0.25  # spacing in standard deviations of the noise
 WIDTH = 0.8  # spacing in standard deviations of a Gaussian kernel at which sums are integrals
 MOST_POINTS = 4000  # of such sums
-SHARE = 1e-2  # of the tolerance that rounding in psi may leave
 
 
 def negligible(prepared: Prepared) -> float:
@@ -227,7 +226,7 @@ def _exact(prepared: Prepared, state: State, psi: Array, gauge: Array, window: l
         density, log_gauge, log_psi = density[inside], gauge[inside], np.log(np.maximum(psi[inside], 0.0) / top)
     logs, product = np.log(density) - log_gauge, np.log(density) - log_gauge + log_psi
     shift = np.max(product)
-    allowed = SHARE * smoothing_tolerance(prepared)
+    allowed = SMOOTHER_SHARE * smoothing_tolerance(prepared)
     return bool(max(error, ROUNDING) * np.sum(np.exp(logs - shift)) < allowed * np.sum(np.exp(product - shift)))
 
 

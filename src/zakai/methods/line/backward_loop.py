@@ -23,6 +23,7 @@ from zakai.numerics.line import window as lw
 from zakai.numerics.line.backward import EXCURSION, by_adjoints
 from zakai.numerics.line.density import support
 from zakai.numerics.line.resolution import ROUNDING as PRECISION
+from zakai.numerics.line.resolution import SMOOTHER_SHARE
 from zakai.numerics.line.steps import SPLIT, SPLIT_FACTOR
 
 Array = Any
@@ -101,7 +102,7 @@ def _exact(prepared: Prepared, k: int, state: State) -> bool:
     displacement, _ = displaced(prepared, values, state.window, start, length)
     noise = length * covariance_at(prepared.system, np.array([state.origin + mean]), start, prepared.theta.real)
     lost = displacement**2 / noise * (1.0 + variance / noise)
-    return bool(np.all(lost < np.log(lb.ROUGH * smoothing_tolerance(prepared) / PRECISION)))
+    return bool(np.all(lost < np.log(SMOOTHER_SHARE * smoothing_tolerance(prepared) / PRECISION)))
 
 
 def _on_one_grid(
@@ -173,7 +174,7 @@ def log_likelihoods(prepared: Prepared, here: slice, observed: Array, points: Ar
 def _shared(state: State, after: lw.Window, later: Message, product: Array, grid: lw.Window) -> list[lw.Window]:
     """Return the grids that may serve for all of an interval: those before and after it, and finer ones."""
     own = state.window
-    first, last = support(np.ascontiguousarray(state.values.real), lb.SMALLEST)
+    first, last = support(np.ascontiguousarray(state.values.real), lw.CUT)
     low, high = min(own.offsets[first], later.ends[0]), max(own.offsets[last], later.ends[1])
     result = []
     for window in sorted({own, after}, key=lambda window: window.spacing, reverse=True):

@@ -39,7 +39,7 @@ from zakai.models.kept import kept, once_for_a_model
 from zakai.models.model import Model
 from zakai.models.numeric import numpy_function
 from zakai.numerics.line import window as lw
-from zakai.numerics.line.resolution import EDGE
+from zakai.numerics.line.resolution import EDGE, SUPPORT, TRANSITION_SHARE
 
 Array = Any
 
@@ -154,8 +154,6 @@ def check_ends(model: Model, theta: Array, inputs: Array | None) -> None:
             )
 
 
-ALLOWED = 0.1  # of the tolerance: the probability that a transition may lose
-END_REACH = 8.0  # standard deviations of the noise within which an end counts
 FAR_DISTANCES = np.array([10.0, 20.0])  # logarithms of distances at which coefficients are powers of the distance
 NOISE_GROWS = 0.1  # exponent of the noise below which it does not grow towards an end
 
@@ -184,11 +182,11 @@ def ends_of_leak(prepared: Prepared, window: lw.Window, ends: Array, start: floa
         drift = system.drift(points[:, None], start, theta)[:, 0].real
         noise = covariance_at(system, points, start, theta).real * np.ones(3)
         # The noise at the end of the density counts, by which it may reach the end of the domain.
-        if not np.isfinite(own) or not noise[0] * length * END_REACH**2 > 1.0 or not (np.isfinite(drift) & (noise > 0)).all():
+        if not np.isfinite(own) or not noise[0] * length * SUPPORT**2 > 1.0 or not (np.isfinite(drift) & (noise > 0)).all():
             continue
         grows = float(np.log(noise[2] / noise[1]) / (FAR_DISTANCES[1] - FAR_DISTANCES[0]))  # 2 - k
         inward = max(float(-2.0 * side * drift[1] / noise[1]), 0.0)  # kappa - 1
-        if grows > NOISE_GROWS and EDGE ** (inward / (inward + grows)) > ALLOWED * prepared.tolerance:
+        if grows > NOISE_GROWS and EDGE ** (inward / (inward + grows)) > TRANSITION_SHARE * prepared.tolerance:
             leaking = True
             result[i] += side * -np.log(EDGE) / (inward + grows)
     return result if leaking else None

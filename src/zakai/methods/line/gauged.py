@@ -19,7 +19,7 @@ import numpy as np
 from scipy.special import expit
 
 from zakai.methods.line.coefficients import coefficients, covariance_at, resolved_parts
-from zakai.methods.line.message import MOST_GRIDS, Message, reliable
+from zakai.methods.line.message import MOST_GRIDS, SURE, Message, reliable
 from zakai.methods.line.model import finite
 from zakai.methods.line.prepared import Prepared, State, TimeInterval
 from zakai.methods.line.transition import (
@@ -42,7 +42,6 @@ Array = Any
 DEGREE = 8  # of the polynomial l that follows a density
 DEPTH = -20.0  # logarithm of the density, relative to its maximum, beyond which l is linear
 BLEND = 3.0  # spacings over which it becomes linear
-UNSURE = 10.0  # errors of psi from which its values count
 BULK = 1e-7  # of the maximum: there smaller values may be tails
 NEAR = 5  # points of a message that tell the curvature of its logarithm beyond an end
 STEEP = 3.0  # least fall beyond the ends of a message, in deviations
@@ -70,7 +69,7 @@ class Psi(NamedTuple):
 
     def reliable(self, weights: Array | float = 1.0) -> tuple[int, int]:
         """Return the first and the last point of psi times weights that are no noise, as far outward as this falls."""
-        product = np.where(self.values.real > UNSURE * np.abs(self.values.imag), self.values.real, 0.0) * weights
+        product = np.where(self.values.real > SURE * np.abs(self.values.imag), self.values.real, 0.0) * weights
         first, last = support(product, BULK)
         while first > 0 and 0.0 < product[first - 1] < product[first]:
             first -= 1

@@ -24,7 +24,7 @@ from zakai.methods.line.update import factor_at_end, grid_check
 from zakai.numerics.line import modes as lm
 from zakai.numerics.line import window as lw
 from zakai.numerics.line.density import circular_rows, waves
-from zakai.numerics.line.grid_choice import PER, SPACING
+from zakai.numerics.line.grid_choice import PER, SPACING, WIDENING
 from zakai.numerics.line.product import General, at_nodes, nodes, weaken
 from zakai.numerics.line.resolution import edge_bound, rounding_bound, spectrum_bound
 from zakai.numerics.line.steps import COLUMNS, STATUSES, Status
@@ -194,8 +194,6 @@ def _points(grid: lw.Window) -> Array:
 
 
 SHARP = 2.0  # how much finer a grid is at least
-COARSE_MARGIN = 7.2  # standard deviations of the noise by which the support grows, and beyond which waves that R' leaves end
-TRIALS = 6  # coarse grids
 
 
 class Coarsened(NamedTuple):
@@ -225,9 +223,9 @@ def coarsened(prepared: Prepared, values: Array, window: lw.Window, length: floa
         return None
     spacing = window.unit * 2.0 ** np.floor(np.log2(SPACING * deviation / window.unit) + 1e-9)
     wide = float(np.sqrt(np.max(covariance.real) * length))
-    low, high = window.offsets[check.first] - COARSE_MARGIN * wide, window.offsets[check.last] + COARSE_MARGIN * wide
-    for _ in range(TRIALS):
-        coarse = _grid(window, float(low - COARSE_MARGIN * wide), float(high + COARSE_MARGIN * wide), float(spacing))
+    low, high = window.offsets[check.first] - WIDENING * wide, window.offsets[check.last] + WIDENING * wide
+    for _ in range(lm.TRIALS):
+        coarse = _grid(window, float(low - WIDENING * wide), float(high + WIDENING * wide), float(spacing))
         decomposed = spectral(prepared, coarse) if coarse.size <= lw.LARGEST else None
         if decomposed is None or spacing < SHARP * window.spacing:
             return None

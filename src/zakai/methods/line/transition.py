@@ -29,7 +29,7 @@ from zakai.methods.line.coefficients import (
     spectral,
     tables,
 )
-from zakai.methods.line.domain import ALLOWED, lost
+from zakai.methods.line.domain import lost
 from zakai.methods.line.modal import coarsened
 from zakai.methods.line.model import finite
 from zakai.methods.line.prepared import NOISE, Prepared, TimeInterval
@@ -44,6 +44,7 @@ from zakai.numerics.line.resolution import (
     LOST_MASS,
     RELIABLE,
     SPECTRUM_FACTOR,
+    TRANSITION_SHARE,
     edge_bound,
     error_made,
     noise_bound,
@@ -384,7 +385,7 @@ def by_decomposition(prepared: Prepared, values: Array, window: lw.Window, lengt
         left, right = check.left > bound, check.right > bound
         if not (left or right):
             missing = lost(float(np.sum(result[0].real)))
-            if missing > ALLOWED * prepared.tolerance:
+            if missing > TRANSITION_SHARE * prepared.tolerance:
                 return None
             report.time += missing
             if window != begin:  # noise that the new grid has brought, which the transition smooths before it is seen

@@ -33,12 +33,12 @@ from zakai.numerics.line.product import (
     weak_error,
     weaken,
 )
+from zakai.numerics.line.resolution import RESOLVED
 from zakai.numerics.line.window import Window
 from zakai.numerics.prior_grid import mixture_log_density, prior_grid
 
 Array = Any
 
-RESOLVED = 1e-11  # spectrum at the highest frequencies that does not ask for a large grid
 UNRESOLVED = 1e-6  # spectrum at the highest frequencies from which waves around a density hide where it ends
 
 

@@ -19,7 +19,7 @@ from zakai.methods.line.prepared import Prepared, TimeInterval
 from zakai.methods.line.transition import Prediction, Report
 from zakai.numerics.line import window as lw
 from zakai.numerics.line.averages import GAUSS_NODES, Panels, interpolation
-from zakai.numerics.line.resolution import ROUNDING
+from zakai.numerics.line.resolution import RESOLVED, ROUNDING, SUPPORT, TRANSITION_SHARE
 from zakai.numerics.line.volumes import Bands, Volumes, advanced, ends_of_steps, volumes
 from zakai.numerics.line.window import local_polynomial
 
@@ -29,7 +29,6 @@ FAST = 5.0  # ranges of a density that the drift crosses in an interval, below w
 LEVELS = ((256, 24), (512, 34), (1024, 48), (2048, 68), (4096, 96), (8192, 136), (16384, 192))  # cells and steps
 FIRST = 0.1  # of the time in which the drift would cross the range of the density: the first step
 FASTEST = 100.0  # ranges of the density in the interval, divided by the tolerance: a faster drift counts as this
-REACH = 8.0  # standard deviations to the end of a density
 KINK_PROBES = 1025  # points between which kinks are sought
 MOST_KINKS = 16
 PROBES = 65  # points between which a formula ceases to have values
@@ -84,7 +83,7 @@ def cell_plan_of(
     fastest = FASTEST * width / (length * prepared.tolerance)
     points = window.origin + np.linspace(ends[0], ends[1], 5)
     noise = float(np.max(covariance_at(prepared.system, points, start, prepared.theta.real)))
-    diffused, last = DIFFUSED * np.array([width / (2.0 * REACH), aim[1]]) ** 2 / max(noise, 1e-300)
+    diffused, last = DIFFUSED * np.array([width / (2.0 * SUPPORT), aim[1]]) ** 2 / max(noise, 1e-300)
     quick = min(FIRST * width / max(min(speed, fastest), 1e-300), FIRST * length, float(diffused))
     parts = Panels([(0.0, length)], 0.0)
     if prepared.system.varying:
@@ -100,8 +99,8 @@ def cell_plan_of(
     centre, scale, walls = 0.5 * (flow.low + flow.high), 0.5 * (flow.high - flow.low), walls_of(prepared, window.origin)
     low, high = np.clip([min(ends[0], centre - scale), max(ends[1], centre + scale)], *walls)
     low, high = (_defined(prepared, window.origin, centre, float(end), start) for end in (low, high))
-    if REACH * aim[1] < scale:
-        centre, scale = aim[0], REACH * aim[1]
+    if SUPPORT * aim[1] < scale:
+        centre, scale = aim[0], SUPPORT * aim[1]
     cells = volumes(window.origin, centre, scale, float(low), float(high), LEVELS[0][0])
     finest = (cells.last - cells.first) / LEVELS[-1][0] * np.hypot(scale, max(abs(ends[0] - centre), abs(ends[1] - centre)))
     cells = cells._replace(cuts=_cuts(prepared, cells, start))
@@ -186,7 +185,7 @@ def _flow_summary(prepared: Prepared, window: lw.Window, ends: Array, start: flo
     """Follow Gaussian parts of a density between two offsets by exponential Euler steps."""
     count, width = _FLOW_POINTS, float(ends[1] - ends[0])
     x, t, travel, most = np.linspace(float(ends[0]), float(ends[1]), count), start, 0.0, 0.0
-    own, noise, walls = np.full(count, (width / (2.0 * REACH)) ** 2), np.zeros(count), walls_of(prepared, window.origin)
+    own, noise, walls = np.full(count, (width / (2.0 * SUPPORT)) ** 2), np.zeros(count), walls_of(prepared, window.origin)
     for step in np.diff(steps):
         near = 1e-6 * np.maximum(np.abs(window.origin + x), 1e-3 * width)
         f = drift_along(prepared, window, np.concatenate([x, x + near, x - near]), t)
@@ -196,7 +195,7 @@ def _flow_summary(prepared: Prepared, window: lw.Window, ends: Array, start: flo
         x, t = np.clip(x + by, *walls), t + step
         slope = np.minimum(2.0 * slope, 0.0)  # what drifts apart, the points show
         own, noise = own * np.exp(slope), noise * np.exp(slope) + step * G * _relative(slope)
-        reach = REACH * np.sqrt(noise)
+        reach = SUPPORT * np.sqrt(noise)
         low, high = float(np.min(x - reach)), float(np.max(x + reach))
         wide = float(np.max(x) - np.min(x)) + 2.0 * float(np.min(reach))
         most = max(most, wide / float(np.sqrt(np.min(own + noise))))
@@ -217,7 +216,6 @@ MOST_DEVIATIONS = 100.0  # range of a density on a uniform grid, in the smallest
 EDGE = 1e-9  # density in the outermost cells, relative to the maximum, beyond which they are too few
 SETTLED = 1e-2  # error above which volumes do not serve
 NARROWEST = 40.0  # range of a density in cells
-SHARE = 0.1  # of the tolerance that volumes may leave
 WIDENINGS = 0.5, 2.0  # ranges of a density by which it grows on each side, where that error is too large
 SMOOTH = 1e-7  # error of a backward interval at which more cells are not tried
 
@@ -249,12 +247,12 @@ def contracted(
     rounding = ROUNDING * 0.5 * (np.pi / window.spacing) ** 2 * noise * length
     general = rough(prepared, interval.inside) or fine
     leak = ends_of_leak(prepared, window, ends, start, length)
-    stiff_noise = leak is not None or (not general and rounding > SHARE * prepared.tolerance)
+    stiff_noise = leak is not None or (not general and rounding > TRANSITION_SHARE * prepared.tolerance)
     if not (general or stiff_noise or speed * length > FAST * width):
         return None
     # Cells do not bring back what the grid does not resolve.
     unresolved = lw.grid_check(values, False, prepared.negligible).aliasing  # where the density is smaller, it may not end
-    allowed = SHARE * max(prepared.tolerance, unresolved)
+    allowed = TRANSITION_SHARE * max(prepared.tolerance, unresolved)
 
     def density(offsets: Array) -> Array:
         return lw.density_at(values, window, offsets)
@@ -462,7 +460,7 @@ def _resampled(prepared: Prepared, cells: Volumes, masses: Array, window: lw.Win
         values = density(new.offsets)
         values = values / np.sum(values)
         check = lw.grid_check(values, False, prepared.negligible)
-        if check.aliasing <= max(1e-11, 1e-2 * error) or new.size >= lw.SIZES[-1]:
+        if check.aliasing <= max(RESOLVED, 1e-2 * error) or new.size >= lw.SIZES[-1]:
             break
         spacing = 1.001 * new.spacing / 2**0.5
     return Prediction(values, new, 0.0, check)

@@ -46,12 +46,12 @@ from zakai.numerics.line import window as lw
 from zakai.numerics.line.backward import ROUNDING
 from zakai.numerics.line.density import support
 from zakai.numerics.line.resolution import ROUNDING as PRECISION
+from zakai.numerics.line.resolution import SMOOTHER_SHARE, SUPPORT
 from zakai.numerics.lobatto import Element
 
 Array = Any
 
 PIECE = 10.0  # standard deviations of the noise in which states at the end share a transition
-REACH = 8.0  # of them around, between which the state at the start lies
 RESOLVING = 3.7  # points in a standard deviation
 RESOLVED = 1e-6  # Legendre coefficient of a density that the points of the transition resolve
 FINE = 4  # points in a spacing between which a distribution is interpolated
@@ -73,7 +73,7 @@ def draw(
     G = covariance_at(prepared.system, x, np.asarray(middle), theta) * np.ones(len(x))
     slope = float(np.max(np.abs(element.derivative(drift))))
     deviation = float(np.sqrt(np.min(G) * min(length, 0.5 / max(slope, 1e-300))))
-    wide = REACH * float(np.sqrt(np.max(G) * length))
+    wide = SUPPORT * float(np.sqrt(np.max(G) * length))
     low, high = min(element.lower, float(z.min())), max(element.upper, float(z.max()))
     result, order = np.empty(len(z)), np.argsort(z)
     pieces = np.floor((z[order] - low) / (PIECE * deviation)).astype(int)
@@ -128,7 +128,6 @@ def _transition(prepared: Prepared, k: int, piece: Element, before: Array, obser
 POINTS = 256  # of a message, on the whole element of the density
 MODES_REACH = 4.0  # standard deviations of the noise around the supports of density and message
 QUADRATURE = 192  # points at which a message is projected onto the modes
-SHARE = 1e-2  # of the tolerance that modes may leave
 
 
 def _window(prepared: Prepared, lower: float, upper: float) -> lw.Window:
@@ -243,7 +242,7 @@ def _by_modes(
         wrong = max(PRECISION * float(np.exp(-length * modes.rates[0])), element.unresolved(propagated * root))
         wrong = wrong * max(float(np.sqrt(psi @ psi)), float(np.max(np.abs(scaled))))
         error = wrong * float(np.sum(own_weights)) / float(own_weights @ (at @ scaled))
-        if 0.0 <= error < SHARE * smoothing_tolerance(prepared):
+        if 0.0 <= error < SMOOTHER_SHARE * smoothing_tolerance(prepared):
             break
     else:
         return None

@@ -20,19 +20,18 @@ from zakai.methods.line.cache import Derived
 from zakai.methods.line.coefficients import covariance_at, offset_of, potential_of, precision_of, tables
 from zakai.methods.line.prepared import Prepared, TimeInterval
 from zakai.methods.line.transition import Report
-from zakai.methods.line.volumes import SHARE, advanced_by, cell_plan_of, kinks_between
+from zakai.methods.line.volumes import advanced_by, cell_plan_of, kinks_between
 from zakai.models.domain import Interval
 from zakai.numerics.line.averages import GAUSS_NODES, GAUSS_WEIGHTS
+from zakai.numerics.line.grid_choice import DEPTH, WIDENING
 from zakai.numerics.line.operator import Spectral
-from zakai.numerics.line.resolution import rounding_bound
+from zakai.numerics.line.resolution import RESOLVED, TRANSITION_SHARE, rounding_bound
 from zakai.numerics.lobatto import Element
 
 Array = Any
 
 SIZES = (24, 32, 48, 64, 96, 128, 192, 256)
 SIZES_OF_PRIORS = (*SIZES, 512, 1024)  # of which no operator is decomposed
-CUT = 36.0  # nats below the maximum where a density ends
-FLOOR = 1e-11  # Legendre coefficient, relative to the largest, that rounding leaves
 SAMPLES = 1001  # points at which the place of a density is sought
 MARGIN = 0.02  # of the length of an element, within which of its end a kink does not count
 BESIDE = 1e-6  # the same for an end of the domain
@@ -56,7 +55,7 @@ def element_of(prepared: Prepared, lower: float, upper: float, size: int) -> Ele
 
 def negligible_of(prepared: Prepared, error: float = 0.0) -> float:
     """Return the Legendre coefficient, relative to the largest, that need not be resolved of a density with an error."""
-    return max(FLOOR, 1e-5 * prepared.tolerance, 1e-2 * min(error, prepared.tolerance))
+    return max(RESOLVED, 1e-5 * prepared.tolerance, 1e-2 * min(error, prepared.tolerance))
 
 
 def without_nan(logs: Array) -> Array:
@@ -66,7 +65,7 @@ def without_nan(logs: Array) -> Array:
 def support(points: Array, logs: Array) -> tuple[float, float]:
     """Return the neighbours of the points at which a density counts."""
     logs = without_nan(logs)
-    here = np.flatnonzero(logs > np.max(logs) - CUT)
+    here = np.flatnonzero(logs > np.max(logs) - DEPTH)
     if not len(here):
         raise InputError("prior: log_density has no finite value inside of the domain")
     return float(points[max(here[0] - 1, 0)]), float(points[min(here[-1] + 1, len(points) - 1)])
@@ -196,7 +195,6 @@ def moments(values: Array, element: Element) -> tuple[Any, Any]:
 
 COUNTS = 1e-14  # density relative to the maximum beyond which it is rounding
 EDGE = 1e-12  # density at an end that is not one of the domain, relative to the maximum
-REACH = 7.2  # standard deviations of the noise by which a density widens
 TRIALS = 24  # elements that are tried
 MOST_PARTS = 64  # of an interval that the volumes do not take as a whole
 PEAK = 1.5  # points in a standard deviation of the noise with which the first element begins
@@ -227,7 +225,7 @@ def _by_modes(
     noise = np.sqrt(np.maximum([np.min(G), np.max(G)], 0.0) * length)
     counts = np.flatnonzero((values / element.weights).real > COUNTS * np.max((values / element.weights).real))
     low, high = element.points[[max(counts[0] - 1, 0), min(counts[-1] + 1, len(values) - 1)]]
-    lower, upper = apart(float(low - REACH * noise[1]), float(high + REACH * noise[1]), domain)
+    lower, upper = apart(float(low - WIDENING * noise[1]), float(high + WIDENING * noise[1]), domain)
     longest = float(np.max(element_of(prepared, lower, upper, SIZES[0]).halves))
     needed = min(2.0 * PEAK * longest / max(noise[0], 1e-300), element.size * longest / float(np.max(element.halves)))
     size = next((size for size in SIZES if size >= min(needed, SIZES[4])), SIZES[-1])
@@ -316,13 +314,13 @@ def _part(
     plan = cell_plan_of(prepared, values, at, ends, interval)  # type: ignore[arg-type]  # by its points
     if plan is None:
         return None
-    result = advanced_by(prepared, before, plan, interval, SHARE * prepared.tolerance)
+    result = advanced_by(prepared, before, plan, interval, TRANSITION_SHARE * prepared.tolerance)
     if result is None:
         return None
     report.time += result.error + plan.unresolved
     cells = result.cells
     density = np.log(np.maximum((result.values / cells.widths).real, 1e-300))
-    here = np.flatnonzero(density > np.max(density) - CUT)
+    here = np.flatnonzero(density > np.max(density) - DEPTH)
     faces, tiny = cells.origin + cells.faces, 1e-9 * (cells.faces[-1] - cells.faces[0])
     if faces[0] - domain.lower < tiny:
         faces[0] = domain.lower

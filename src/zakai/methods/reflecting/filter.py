@@ -20,7 +20,6 @@ from zakai.methods.line.prepared import NOISE, Prepared
 from zakai.methods.line.transition import Report
 from zakai.methods.line.update import error_remainder, factor_at_end, outside_tables, spread
 from zakai.methods.reflecting.elements import (
-    CUT,
     SAMPLES,
     SIZES,
     SIZES_OF_PRIORS,
@@ -38,6 +37,7 @@ from zakai.methods.reflecting.elements import (
 )
 from zakai.models.numeric import numpy_function
 from zakai.models.prior import DensityPrior
+from zakai.numerics.line.grid_choice import DEPTH
 from zakai.numerics.line.product import General, Likelihood, normalized, place
 from zakai.numerics.lobatto import Element
 from zakai.numerics.prior_grid import mixture_log_density, prior_grid
@@ -82,7 +82,7 @@ def init(prepared: Prepared, prior: Any) -> State:
         if np.any(covs[:, 0, 0] <= 1e-28 * means[:, 0] ** 2):
             raise InputError("prior: a variance is zero; a grid needs a density, so give it a small variance")
         mixture = mixture_log_density(weights, means, covs, [False])
-        reach = np.sqrt(2.0 * CUT * covs[:, 0, 0])
+        reach = np.sqrt(2.0 * DEPTH * covs[:, 0, 0])
         lower, upper = np.clip([np.min(means[:, 0] - reach), np.max(means[:, 0] + reach)], domain.lower, domain.upper).tolist()
 
         def logs(x: Array) -> Array:
@@ -143,7 +143,7 @@ def _multiplied(
 def _narrow(values: Array, element: Element) -> bool:
     """Return whether a density fills less than a quarter of an element."""
     density = logarithm((values / element.weights).real)
-    here = element.points[density > np.max(density) - CUT]
+    here = element.points[density > np.max(density) - DEPTH]
     return bool(here[-1] - here[0] < 0.25 * (element.upper - element.lower))
 
 

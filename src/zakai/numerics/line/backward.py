@@ -21,6 +21,7 @@ from zakai.numerics.line.averages import AVERAGES, EARLY, LATE, MEAN, MOST_MAGNU
 from zakai.numerics.line.density import circular_moments, highest_of, moments, shifted, spectrum, support, waves
 from zakai.numerics.line.modes import decayed, propagate
 from zakai.numerics.line.resolution import ROUNDING as PRECISION
+from zakai.numerics.line.resolution import SMOOTHER_SHARE
 from zakai.numerics.line.splitting import STEEPEST, Filtering, differences, residual, split
 from zakai.numerics.line.steps import (
     CONSTANTS_TYPE,
@@ -39,10 +40,8 @@ from zakai.numerics.line.window import CUT
 
 Array = NDArray[Any]
 
-SMALLEST = 1e-13  # value of a smoothed density relative to its maximum that is not rounding
 UNRESOLVED = 1e-5  # spectrum of a smoothed density at the highest frequencies up to which sums over the points are integrals
 FEWEST = 12  # points of a message
-ROUGH = 0.01  # of the error that an interval may make: what a grid and rounding may leave
 ROUNDING = 1e-15  # of the maximum: smaller values of psi count as this
 SURE = 100.0  # errors of psi from which its small values count
 LEAST = 1e-11  # of the maximum: the same
@@ -137,7 +136,7 @@ def multiplied(
     size, total, least = b.size, 0.0, floor * density[highest_of(density)]
     for j in range(size):
         product[j] = density[j] * b[j] if density[j] > least else 0.0
-    least = SMALLEST * product[highest_of(product)]
+    least = CUT * product[highest_of(product)]
     for j in range(size):
         product[j] = product[j] if product[j] > least else 0.0
         total += product[j]
@@ -146,7 +145,7 @@ def multiplied(
     for j in range(size):
         product[j] /= total
         b[j] /= total
-    left, right, _, _, _, aliasing, _, _, _ = spectrum(product, CUT, SMALLEST, *waves, False)
+    left, right, _, _, _, aliasing, _, _, _ = spectrum(product, CUT, CUT, *waves, False)
     row[LOG_MASS] += np.log(total)
     row[ALIASING], row[EDGE] = aliasing, 0.0 if closed else max(left, right)
     if closed:
@@ -217,7 +216,7 @@ def _decomposed(
         propagate(modes, decay, now)
         highest = now[highest_of(now)]
         noise = PRECISION * np.sqrt(norm) * max(1.0, decay[0])
-        left, right, _, _, _, aliasing, _, _, _ = spectrum(now, CUT, SMALLEST, long_cosines, long_sines, False)
+        left, right, _, _, _, aliasing, _, _, _ = spectrum(now, CUT, CUT, long_cosines, long_sines, False)
         level = max(noise, (ROUNDING + 2.0 * aliasing) * highest)
         # b relative to where its product with the density is largest.
         density, least = densities[i], floors[i] * densities[i, highest_of(densities[i])]
@@ -236,7 +235,7 @@ def _decomposed(
                 weight += density[j] * ratio
                 total += density[j] * b[j]
         made = level * weight / total + (0.0 if closed else 10.0 * max(left, right))
-        if not (made < ROUGH * most):
+        if not (made < SMOOTHER_SHARE * most):
             return completed, error, scale, reliable
         row[LOG_MASS] = scale + top + reference
         first, last = multiplied(b, density, floors[i], negligible, closed, (cosines, sines), products[i], row)
@@ -381,7 +380,7 @@ def _adjoint(
         if start < 0 or start + size > table.shape[3]:
             return completed, first, last, start, error
         if not closed:  # the paths from one support to the other
-            begins, ends = support(densities[i], SMALLEST)
+            begins, ends = support(densities[i], CUT)
             noise = np.sqrt(max(covariances[i].max(), 0.0) * lengths[i]) / spacing
             if not held(densities[i], starts[i] - start, product, noise):
                 return completed, first, last, start, error

@@ -251,7 +251,7 @@ PROFILE = 4096  # offsets at which f and G are known without a grid
 REACH = 7.6  # standard deviations of the noise by which the support grows
 FAR = 3.0  # ranges of a density that it moves in an interval, above which grids move with it
 SPACING = 0.34  # spacing in standard deviations of the noise, at most: the shortest wave decays by exp(-42)
-_MARGIN = 7.2  # of them beyond the support: the waves that R' leaves everywhere end there, and spread from the ends
+WIDENING = 7.2  # of them beyond the support: the waves that R' leaves everywhere end there, and spread from the ends
 _NARROW = 7.0  # support of a density in standard deviations of the noise
 _APART = 32  # the centres of coarse grids are multiples of so many spacings
 _SIZES = np.array(SIZES)
@@ -297,7 +297,7 @@ def outlook(low: float, high: float, tau: float, unit: float, profile: Array) ->
     spacing = unit * 2.0 ** (0.5 * np.floor(2.0 * np.log2(spacing / unit) + 1e-9))
     half, centre = 0.5 * (high - low) * np.exp(-slow) + REACH * wide * np.sqrt(relative(2.0 * slow)), 0.5 * (low + high)
     spacing = np.nan if abs(shift) > 2.0 * FAR * half else spacing
-    return Outlook(spacing, centre - half + min(shift, 0.0), centre + half + max(shift, 0.0), _MARGIN * wide)
+    return Outlook(spacing, centre - half + min(shift, 0.0), centre + half + max(shift, 0.0), WIDENING * wide)
 
 
 @helper

@@ -282,7 +282,7 @@ class Results(NamedTuple):
 
 
 STAY, OWN, PLACE = range(3)  # steps on the grid of the density; on its own grid the first transition, or none
-_TRIALS = 6  # coarse grids on which a step is tried
+TRIALS = 6  # coarse grids on which a step is tried
 
 
 @kernel(
@@ -339,7 +339,7 @@ def advance(
         if not stays or i == 0:
             answer[0], answer[1], answer[2] = centre, spacing, now.size
         # The transition.
-        for trial in range(_TRIALS):
+        for trial in range(TRIALS):
             if not alone:
                 wanted(left, right, coarse, margin, answer)
             if not stays or i == 0:
@@ -374,7 +374,7 @@ def advance(
                 answer[1] = spacing * ((size + on if on_right > bound * top else ends) - half)
                 answer[2] = spacing
                 return i, RANGE
-            if trial == _TRIALS - 1:
+            if trial == TRIALS - 1:
                 return i, FAILED
             alone, margin = False, beyond
             left -= (last - first) * coarse / 3.0 if on_left > bound * top else 0.0

@@ -24,7 +24,7 @@ from zakai.numerics.compiled import kernel
 from zakai.numerics.line import window as lw
 from zakai.numerics.line.density import moments, support
 from zakai.numerics.line.grid_choice import DEPTH, LEVELS, MOST_CELLS
-from zakai.numerics.line.resolution import GROSS
+from zakai.numerics.line.resolution import GROSS, RESOLVED
 from zakai.numerics.line.steps import exponent_added
 
 Array = NDArray[Any]
@@ -101,7 +101,7 @@ def multiplied(values: Array, window: lw.Window, likelihood: Likelihood, rough: 
     """
     product = _product(values, window, values, window, likelihood)
     check = lw.grid_check(product.values, window.closed)
-    resolved = check.aliasing <= 1e-11 or (check.aliasing <= rough and check.rough)
+    resolved = check.aliasing <= RESOLVED or (check.aliasing <= rough and check.rough)
     if resolved and max(check.left, check.right) < 1e-10:
         return product
     new = lw.fitted(check, window) if likelihood.linear else _placed(values, window, likelihood)
@@ -114,7 +114,7 @@ def multiplied(values: Array, window: lw.Window, likelihood: Likelihood, rough: 
             return product
         check = lw.grid_check(product.values, new.closed)
         noisy = check.rough and check.aliasing < GROSS
-        if check.aliasing <= 1e-11 or new.size >= (lw.LARGE if noisy else lw.SIZES[-1]):
+        if check.aliasing <= RESOLVED or new.size >= (lw.LARGE if noisy else lw.SIZES[-1]):
             break
         before, new = new, finer(product.values, new, check)
         if new == before:

@@ -12,11 +12,15 @@ NEGLIGIBLE = 1e-13  # spectrum relative to the mass that need not be resolved
 SPECTRUM_FACTOR = 30.0  # times the spectrum that need not be resolved: more needs another grid
 SPECTRUM_SHARE = 1e-5  # of the tolerance that a transition may leave at the highest frequencies
 GROSS = 1e-4  # spectrum at the highest frequencies from which it is that of what a grid does not resolve, not of noise
+RESOLVED = 1e-11  # spectrum, or Legendre coefficient, at the highest frequencies that is rounding
 EDGE = 1e-11  # density at the outermost points, relative to the maximum, that a grid may cut off
 EDGE_OF_ALIASING = 4.0  # spectra at the highest frequencies, whose waves reach the ends as well
 ROUNDING = 4e-16  # rounding error of a decomposition or an exponential, relative to the norm
 LEAST_ROUNDING = 1e-11  # rounding error of a transition that needs no other one
 RELIABLE = 1e-3  # of the promised error: smaller estimates are not reported
+TRANSITION_SHARE = 0.1  # of the tolerance that a transition of its own kind may leave, or lose of the mass
+SMOOTHER_SHARE = 0.01  # of the error that an interval of a smoother may make: what modes and rounding may leave
+SUPPORT = 8.0  # standard deviations to the end of a density
 LOST_MASS = 1e-3  # of a transition, beyond which it fails
 
 
