@@ -84,8 +84,8 @@ def _reason(name: str, model: Model, tolerance: float | None) -> str:
     reason = "particles, which hold for any model: no other method that auto tries holds for this system"
     if all_hold(conditions_of("yau-yau", model)) is True:
         reason = (
-            "no exact method holds, and of the methods for any system it needs the least time for its accuracy, or is more exact "
-            f"and needs little more (expected for an observation: {work_in_words(model, tolerance)})"
+            "no exact method holds, and this one is expected to need the least time for its accuracy, or at most "
+            f"{AFFORDABLE:g} times that and to be more exact (for an observation {work_in_words(model, tolerance)})"
         )
     if (model.n < 3 and name == "yau-yau") or all_hold(conditions_of("tensor-train", model)) is not True:
         return reason
