@@ -2,10 +2,10 @@
 
     python benchmarks/choices.py [NAME ...] [--methods auto yau-yau] [--limit 60] [--judge 100000]
 
-Each line is one system and one method in a process of its own with a limit of processor seconds: the method that ran, its
-seconds with the loading of kernels, the root mean square of the errors of means in posterior standard deviations, the difference
-of the log-likelihood, and the warnings.  The judge is the mean of two runs of `guided-particles` with many particles and other
-seeds, kept in the folder for temporary files; `judge` is half of their distance.
+Each line is one system and one method in a process of its own with a limit of processor seconds: the method that ran, its seconds
+with the loading of kernels, the root mean square of the errors of means in posterior standard deviations, the difference of the
+log-likelihood, and the warnings.  The judge is the mean of two runs of `guided-particles` with many particles and other seeds,
+kept in the folder for temporary files; `judge` is half of their distance.
 """
 
 from __future__ import annotations

@@ -113,8 +113,8 @@ def test_what_is_refused_by_the_filter_is_refused_here():
 
 @pytest.mark.parametrize(
     ("expected", "words"),
-    [(Expected(0.0314), "about 0.03 s"), (Expected(4.4), "about 4 s"), (Expected(161.2), "about 161 s"),
-     (Expected(60.0, True), "more than 60 s")],
+    [(Expected(0.0314), "about 0.03 s"), (Expected(4.4), "about 4 s"), (Expected(9.7), "about 10 s"),
+     (Expected(161.2), "about 161 s"), (Expected(60.0, True), "more than 60 s")],
 )  # fmt: skip
 def test_the_words_have_the_digits_that_are_known(expected, words):
     assert str(expected) == words

@@ -84,11 +84,13 @@ def _reason(name: str, model: Model, tolerance: float | None) -> str:
     reason = "particles, which hold for any model: no other method that auto tries holds for this system"
     if all_hold(conditions_of("yau-yau", model)) is True:
         reason = (
-            "no exact method holds, and of the methods for any system it needs the least time for its accuracy, or is more exact "
-            f"and needs little more (expected for an observation: {work_in_words(model, tolerance)})"
+            "no exact method holds, and this one is expected to need the least time for its accuracy, or at most "
+            f"{AFFORDABLE:g} times that and to be more exact (for an observation {work_in_words(model, tolerance)})"
         )
-    named = name == "guided-particles" and all_hold(conditions_of("tensor-train", model)) is True
-    return f"{reason}; tensor-train by name gives the whole density, more exactly" if named else reason
+    if (model.n < 3 and name == "yau-yau") or all_hold(conditions_of("tensor-train", model)) is not True:
+        return reason
+    how = "more exactly" if name == "guided-particles" else "often in less time"
+    return f"{reason}; tensor-train by name gives the whole density, {how}"
 
 
 def divided(
@@ -123,12 +125,18 @@ def divided(
 
 
 def faster(model: Model, name: str, seconds: float) -> str | None:
-    """Return a method for any system that holds and is expected to need a third of `seconds` for an observation, or less."""
-    for other in GENERAL:
+    """Return a method for any system that is expected to need a third of `seconds` for an observation, or less; None without one.
+
+    It holds, and is less exact than the method `name` or is expected to need less time.
+    """
+    own = expected_work(name, model, None)
+    for place, other in enumerate(GENERAL):
         work = None if other == name else expected_work(other, model, None)
-        if work is not None and not work.fails and AFFORDABLE * work.seconds <= seconds:
-            if all_hold(conditions_of(other, model)) is True:
-                return other
+        if work is None or work.fails or AFFORDABLE * work.seconds > seconds:
+            continue
+        less_exact = name not in GENERAL or place > GENERAL.index(name)
+        if (less_exact or (own is not None and work.seconds < own.seconds)) and all_hold(conditions_of(other, model)) is True:
+            return other
     return None
 
 

@@ -35,7 +35,7 @@ class Expected(NamedTuple):
     def __str__(self) -> str:
         """As in "about 0.4 s"."""
         bound = "more than" if self.at_least else "about"
-        return f"{bound} {self.seconds:.1g} s" if self.seconds < 10 else f"{bound} {self.seconds:.0f} s"
+        return f"{bound} {self.seconds:.1g} s" if self.seconds < 9.5 else f"{bound} {self.seconds:.0f} s"
 
 
 class _LateError(ZakaiError):
