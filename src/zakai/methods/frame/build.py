@@ -24,7 +24,7 @@ LEAST = 0.4  # of the tolerance that earlier errors may leave
 EDGE = 0.3  # share of the tolerance that may be near an end of an axis
 ROUGH = 4.0  # tolerances of error off the grid, above which the grid is made finer
 WIDER = 0.25  # share of a box that is added at both ends of an axis with mass there
-FLOOR = 1e-3  # of the largest value, below which errors do not count relative to the value
+FLOOR = 1e-5  # of the largest value, below which errors do not count relative to the value
 
 
 class Report(NamedTuple):
@@ -95,7 +95,7 @@ class Builder:
             function = function.about(np.where(angles, mass.points @ mass.weights, np.nan))
         closed = closed_axes(mass, angles, rule)
         grid, D = place(function, mass, closed, rule, noise, stretch)
-        control = mass.control(CONTROLS)
+        control = mass.control(CONTROLS, rule.tolerance)
         found, report = self._crossed(Placed(grid, D), function, control, options)
         out = (self._edges > EDGE * rule.tolerance) & ~closed
         rough = report.off_grid > ROUGH * rule.tolerance and report.on_grid < 2.0 * rule.tolerance
@@ -122,9 +122,13 @@ class Builder:
 
 
 def difference(one: Callable[[Array], Array], other: Callable[[Array], Array], control: Mass) -> float:
-    """Return the difference of two densities in L1, relative to the second, by weighted points of it."""
+    """Return the difference of two densities relative to the second, by weighted points of it.
+
+    It is that in L1, where a point far from the mean counts by its distance in deviations: so much it moves the mean.
+    """
     values = other(control.points)
     top = float(np.abs(values).max())
     if not top > 0:
         return np.inf
-    return float(control.weights @ (np.abs(one(control.points) - values) / np.maximum(values, FLOOR * top)))
+    relative = np.abs(one(control.points) - values) / np.maximum(values, FLOOR * top)
+    return float(control.weights @ (relative * np.maximum(control.distances(), 1.0)))

@@ -244,7 +244,7 @@ def _audited(chain: Chain, u: Train, coarser: Prediction, count: int, number: in
     allowed, length = TIME_SHARE * chain.prepared.tolerance, chain.interval.stop - chain.interval.start
     while True:
         finer, more = chain.first(u, 2 * count)
-        control = finer.mass.control(CONTROLS)
+        control = finer.mass.control(CONTROLS, chain.prepared.tolerance)
         error = difference(coarser.function.scaled(coarser.log_scale - finer.log_scale), finer.function, control)
         # What the builds of both differ by is not an error of time.
         error = max(error - sum(report.off_grid for report in chain.builder.reports), 0.3 * error)

@@ -20,6 +20,7 @@ Array = Any
 # a density that is not Gaussian; with .03 alone that adds up over substeps (a robot with a wide heading: .007 deviations).
 TOGETHER, TOGETHER_TOLERANCES = 0.03, 1.0
 LEFT_OUT = 1e-3  # share of the tolerance that a box may leave out: every separated part with more mass is kept
+FAR = 8  # control points that are the farthest of the heavy ones
 CHANCE = 2.0  # standard errors of a correlation that chance explains
 REACH = 1.3  # of the extreme of the mass
 MOST_POINTS = 160  # along an axis: two modes with twenty deviations between them
@@ -79,13 +80,29 @@ class Mass(NamedTuple):
             points[d] = c + np.remainder(points[d] - c + math.pi, 2 * math.pi) - math.pi
         return Mass(points, self.weights)
 
-    def control(self, count: int) -> Mass:
-        """Return points for checks, with weights: most in proportion to the mass, the others to its square root."""
-        root = np.sqrt(self.weights)
-        chance = 0.7 * self.weights + 0.3 * root / root.sum()
+    def distances(self) -> Array:
+        """Return the distances (P,) from the mean in deviations, those of a Gaussian about one."""
+        mean, P = self.moments()
+        scale = np.maximum(np.sqrt(np.diag(P)), 1e-300)
+        apart = (self.points - mean[:, None]) / scale[:, None]
+        unit = P / np.outer(scale, scale) + 1e-9 * np.eye(len(P))
+        return np.asarray(np.sqrt(np.sum(apart * np.linalg.solve(unit, apart), axis=0) / len(P)))
+
+    def control(self, count: int, tolerance: float) -> Mass:
+        """Return points for checks, with weights: most in proportion to what they move the mean, the others to root of the mass.
+
+        They are drawn in the order of their distance from the mean, so that a part of little mass far from the others has its
+        share of them; the farthest of the heavy ones are among them.
+        """
+        distances, root = self.distances(), np.sqrt(self.weights)
+        moved = self.weights * np.maximum(distances, 1.0)
+        chance = 0.7 * moved / moved.sum() + 0.3 * root / root.sum()
+        order = np.argsort(distances, kind="stable")
         places = (np.arange(count) + 0.5) / count
-        chosen = np.minimum(np.searchsorted(np.cumsum(chance), places), len(chance) - 1)
-        weights = self.weights[chosen] / chance[chosen]
+        drawn = order[np.minimum(np.searchsorted(np.cumsum(chance[order]), places), len(chance) - 1)]
+        far = order[self.heavy(tolerance)[order]][-FAR:]
+        chosen = np.concatenate([drawn, far])
+        weights = np.concatenate([self.weights[drawn] / (count * chance[drawn]), self.weights[far]])
         return Mass(np.ascontiguousarray(self.points[:, chosen]), weights / weights.sum())
 
 
