@@ -188,3 +188,17 @@ def test_a_density_is_saved_to_the_bit_and_is_the_prior_of_a_later_record(tmp_pa
     result = zakai.filter(later, zakai.Record(record.times[2:], record.values[2:], "samples"), "tensor-train")
     deviations = np.sqrt(np.diag(whole.cov[-1]))
     assert np.abs((result.mean[-1] - whole.mean[-1]) / deviations).max() < 0.03
+
+
+def test_the_estimate_holds_for_a_distance_that_bearings_hardly_show():
+    model = zakai.Model(
+        state=NAMES, drift=["vx", "vy", "0", "0"], diffusion=[[0, 0], [0, 0], [0.02, 0], [0, 0.02]],
+        observation=["atan2(py - (t - 10)*abs(sin(0.2*t))/3, px - 0.8*t)"], observation_kind="samples",
+        observation_noise=[[4e-4]],
+        prior={"kind": "gaussian", "mean": [10, 8, -0.3, 0.2], "cov": np.diag([9, 9, 0.04, 0.04]).tolist()},
+    )  # fmt: skip
+    times = np.cumsum(np.random.default_rng(103).uniform(0.2, 0.8, 10))
+    _, record = zakai.simulate(model, times, seed=3)
+    result, finer = zakai.filter(model, record, "tensor-train"), zakai.filter(model, record, "tensor-train", tolerance=1e-3)
+    error = np.abs((result.mean - finer.mean)[1:] / np.sqrt(result.variance[1:])).max(axis=1)
+    assert (error <= 3 * result.error_estimate[1:]).all()

@@ -19,8 +19,8 @@ CONTROLS = 600  # with 96 the tails of a skewed density of three states were nev
 CLOUD = 1024
 # The error of a mean is 1 to 3 times the relative error of the builds, with the control points that happened to be drawn
 # (bearings, turns, re-entry; rms over times and coordinates): the builds have half of the tolerance.
-SHARE, CORES = 0.5, 0.1
-LEAST = 0.4  # of the tolerance that earlier errors may leave
+SHARE, CORES = 0.5, 0.25
+LEAST = 0.6  # of the tolerance that earlier errors may leave
 EDGE = 0.3  # share of the tolerance that may be near an end of an axis
 ROUGH = 4.0  # tolerances of error off the grid, above which the grid is made finer
 WIDER = 0.25  # share of a box that is added at both ends of an axis with mass there
@@ -98,7 +98,7 @@ class Builder:
         control = mass.control(CONTROLS, rule.tolerance)
         found, report = self._crossed(Placed(grid, D), function, control, options)
         out = (self._edges > EDGE * rule.tolerance) & ~closed
-        rough = report.off_grid > ROUGH * rule.tolerance and report.on_grid < 2.0 * rule.tolerance
+        rough = report.off_grid > ROUGH * rule.tolerance and report.on_grid < 2.0 * rule.tolerance and not report.capped
         if out.any() or rough:
             span = np.where(out, WIDER * (grid.high - grid.low), 0.0)
             grid = with_spacing(grid, grid.low - span, grid.high + span, 0.7 * grid.step if rough else grid.step, rule)

@@ -34,7 +34,7 @@ TIME_SHARE, GAIN, ACCEPTED, SAFETY = 1.0, 4.0, 8.0, 0.7
 IN_TAILS = 0.03  # error of a mean over tolerance e^depth: linear tracks with observations 4 and 6 deviations away
 BEYOND = 0.3  # error of a mean over the distance of an observation, where a Gaussian stands for the tails
 # Error of a mean over the error of a build in L1: those of different builds have different signs.
-OF_MEAN = 0.7
+OF_MEAN = 0.6
 OF_TAILS = 0.25  # growth of the logarithm of a relative error with the depth, on wide tracks seen by bearings
 WITHIN = 3.0  # tolerances that the error of a mean may reach
 FIGURES = (

@@ -24,7 +24,7 @@ from zakai.numerics.trains.train import Train
 Array = Any
 SEEDS, FEWEST_SEEDS = 2, 6  # points of the mass in the sets of the first sweep beyond the rank that is expected, and at least
 KEPT_GAIN = 0.7  # ratio of the errors of two sweeps above which another one gains too little
-MOST_SWEEPS = 6
+MOST_SWEEPS, CAPPED_SWEEPS = 6, 2  # and where a rank meets its limit: more sweeps do not make up for it
 WORST = 8  # control points with the largest errors that join the sets: the rank can grow by so many in a sweep
 
 
@@ -134,7 +134,8 @@ def cross(grid: Grid, function: Function, control: Array, options: Options, peri
         errors = np.abs(train.on_grid(index) - values) / size
         error = float(errors.mean())
         sweep += 1
-        if error < options.enough * options.tolerance or error > KEPT_GAIN * last or sweep == MOST_SWEEPS:
+        most = CAPPED_SWEEPS if work.capped else MOST_SWEEPS
+        if error < options.enough * options.tolerance or error > KEPT_GAIN * last or sweep >= most:
             return Built(train, work.evaluations, sweep, error, work.capped)
         last = error
         worst = index[np.argsort(-errors * size, kind="stable")[:WORST]]
