@@ -69,9 +69,9 @@ MOVE_CONTROL = (1.0, 1.2, 4.0, 0.4, 1.0)  # power, change, most sweeps, rho, sha
 VARIANCE = 5.0  # that of a mean times N, in variances of the state, that the number of particles is chosen for
 MOST_GROWTH = 4
 REPEATED, NARROWEST = 2.0, 0.02  # excess of the time error at which an interval is repeated, and least narrowing that counts
-# Of the time error: the share of the allowed one below which it holds in so many more intervals, the excess of substeps over
-# those that were expected up to which it holds twice as long as before, and the ratio of errors by length up to which it holds.
-SURE, TRUSTED, FORESEEN, LONGER = 0.5, 8, 1.3, 4.0
+# Of the time error: the share of the allowed one below which it holds in so many more intervals, in how many it does where it was
+# no more than so many times the substeps that were expected, and the ratio of errors by length up to which it holds.
+SURE, TRUSTED, TRUSTED_LESS, FORESEEN, LONGER = 0.5, 4, 1, 1.3, 4.0
 
 
 def init(prepared: Prepared, prior: Any) -> State:
@@ -97,7 +97,7 @@ def _at_start(prepared: Prepared, particles: Array, first: Array, gaussian: tupl
     width = system.law.width if system.law is not None else system.factor.width  # type: ignore[union-attr]
     window = Window.begin(particles, first, gaussian, (width, len(prepared.motion.law[3])))
     logs, nothing = np.full(count, -np.log(count)), np.zeros(system.n)
-    control = Control(0, 1, 4, 0.0, 0.0, 0, 0, 1.0, VARIANCE, 0.0, 0.0, 0.0, 0.0, 1.0, 0, 0.0)
+    control = Control(0, 1, 4, 0.0, 0.0, 0, 1.0, VARIANCE, 0.0, 0.0, 0.0, 0.0, 1.0, 0, 0.0)
     return State(particles, logs, window, Genealogy.begin(count), control, nothing, nothing, np.ones(system.n))
 
 
@@ -134,7 +134,7 @@ class Advanced(NamedTuple):
 
     `gained` is the increment of the log-likelihood, `noise` (D, N) that of the interval, `predicted` (n',) the spread of the
     coordinates before the weights of the observation act, `deviations` (n,) those of the states before it, `acceptance` that of
-    moves between powers of the likelihood; `lost` is the share of the particles that left every bounded set, and `unseen`
+    moves between powers of the likelihood; the next one is the share of the particles that left every bounded set, and `unseen`
     says that few particles are left by an observation that says nothing of the noise.
     """
 
@@ -293,13 +293,9 @@ def _steps(
     pilots = Pilots(taken(state.particles, chosen), mean, scale, int(key[0] >> np.uint64(2)), allowed)
     found = steps_of(prepared.motion, interval, values, pilots, guess)
     count, stages = found.scheme
-    # The more often the error was what had been expected, the longer it is.
     expected = count * np.sqrt(found.error / allowed) <= FORESEEN * needed
-    streak = min(2 * control.streak + 1, TRUSTED) if expected else 0
-    trusted = TRUSTED if found.surely <= SURE * allowed else streak
-    return found, control._replace(
-        substeps=count, stages=stages, error=found.error, length=length, trusted=trusted, streak=streak
-    )
+    trusted = TRUSTED if found.surely <= SURE * allowed else TRUSTED_LESS if expected else 0
+    return found, control._replace(substeps=count, stages=stages, error=found.error, length=length, trusted=trusted)
 
 
 def _carried(motion: Motion, events: Events, mean: Array, shift: Array) -> Array:

@@ -20,7 +20,7 @@ from zakai.records.inputs import Inputs
 PILOTS = 128  # particles by which the time step is measured
 # Of a mean or a standard deviation by one interval, in standard deviations, that a step is chosen for, or this share of the
 # standard error of a mean where that is more, up to a largest one.
-TIME_ERROR, OF_RANDOM_ERROR, MOST_TIME_ERROR = 0.01, 0.1, 0.1
+TIME_ERROR, OF_RANDOM_ERROR, MOST_TIME_ERROR = 0.005, 0.1, 0.1
 MOST_SUBSTEPS = 64
 EXACT = 1e-3  # relative error of the flow of an affine system without time that is not measured
 KEPT_LENGTHS = 64  # of substeps whose noise is kept

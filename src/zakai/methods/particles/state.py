@@ -20,7 +20,7 @@ class Control(NamedTuple):
     """What decides the next step beside the particles.
 
     `interval` counts intervals; `substeps` with `stages`, whose `error` was measured in an interval of this `length`, and is
-    `trusted` in so many more, for `streak` of them last time; `narrow` the ratio of the deviations after and before the last
+    `trusted` in so many more; `narrow` the ratio of the deviations after and before the last
     observation, `variance` of a mean times N, `losses` the sum of its means and `work` that of steps and moves, `excess` what has
     added up since the last move beyond `floor`, what that has left, `rate` its acceptance, `doubtful_until` the number of
     resamplings until which standard errors are lower bounds, and `shifted` the variance of the log-likelihood by the time step.
@@ -32,7 +32,6 @@ class Control(NamedTuple):
     error: float
     length: float
     trusted: int
-    streak: int
     narrow: float
     variance: float
     losses: float
