@@ -199,3 +199,8 @@ def test_columns_that_go_by_position_are_named_before_the_record_is_filtered(zak
     assert refused.code == 2 and last.startswith("error: ")
     answer = zakai("filter", "plane.toml", "named.csv", "-o", "r.nc")
     assert answer.code == 0 and answer.err.count("by their position") == 1
+
+
+def test_reproduce_without_a_name_lists_the_names(zakai):
+    listed = zakai("reproduce")
+    assert listed.code == 0 and "chen-luo-yau-2017" in listed.out.split() and "tracking" in listed.out.split()

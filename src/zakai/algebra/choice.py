@@ -89,7 +89,7 @@ def _reason(name: str, model: Model, tolerance: float | None) -> str:
         )
     if (model.n < 3 and name == "yau-yau") or all_hold(conditions_of("tensor-train", model)) is not True:
         return reason
-    how = "more exactly" if name == "guided-particles" else "often in less time"
+    how = "more exactly, and may take much longer" if name == "guided-particles" else "often in less time"
     return f"{reason}; tensor-train by name gives the whole density, {how}"
 
 

@@ -247,7 +247,7 @@ def study(
 
 @app.command()
 def reproduce(
-    name: Annotated[str, typer.Argument(metavar="NAME", help="A published experiment, such as chen-luo-yau-2017.")],
+    name: Annotated[str, typer.Argument(metavar="NAME", help="A published experiment; without a name all are listed.")] = "",
     folder: Annotated[Path | None, typer.Option("-o", "--output", metavar="FOLDER", help="Where pictures and tables go.")] = None,
     option: Annotated[
         list[str] | None, typer.Option(metavar="KEY=VALUE", help="An option of the study, such as paths=5; repeatable.")

@@ -16,6 +16,9 @@ def reproduce(name: str, folder: Path | None, settings: list[str]) -> None:
     from zakai import studies
 
     known = studies.names()
+    if not name:
+        print("\n".join(known))
+        return
     if name not in known:
         raise InputError(f'there is no study "{name}"; there is: {", ".join(known)}')
     options = options_of(settings)

@@ -24,7 +24,7 @@ LEAST = 0.6  # of the tolerance that earlier errors may leave
 EDGE = 0.3  # share of the tolerance that may be near an end of an axis
 ROUGH = 4.0  # tolerances of error off the grid, above which the grid is made finer
 WIDER = 0.25  # share of a box that is added at both ends of an axis with mass there
-FLOOR = 1e-5  # of the largest value, below which errors do not count relative to the value
+FLOOR = 1e-4  # of the largest value, below which errors do not count relative to the value
 
 
 class Report(NamedTuple):
