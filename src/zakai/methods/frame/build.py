@@ -12,7 +12,7 @@ from zakai.methods.frame.placement import Mass, Placed, Rule, closed_axes, place
 from zakai.methods.frame.state import Prepared
 from zakai.methods.particles.programs import Array
 from zakai.numerics.trains.carried import Carried
-from zakai.numerics.trains.cross import Options, cross
+from zakai.numerics.trains.cross import FLOOR, Options, cross
 from zakai.numerics.trains.train import Train
 
 CONTROLS = 600  # with 96 the tails of a skewed density of three states were never seen, at any tolerance
@@ -24,7 +24,6 @@ LEAST = 0.6  # of the tolerance that earlier errors may leave
 EDGE = 0.3  # share of the tolerance that may be near an end of an axis
 ROUGH = 4.0  # tolerances of error off the grid, above which the grid is made finer
 WIDER = 0.25  # share of a box that is added at both ends of an axis with mass there
-FLOOR = 1e-4  # of the largest value, below which errors do not count relative to the value
 
 
 class Report(NamedTuple):
@@ -111,7 +110,8 @@ class Builder:
         self, placed: Placed, function: Callable[[Array], Array], control: Mass, options: Options
     ) -> tuple[Train, Report]:
         expected = max(function.terms[0].density.ranks) if isinstance(function, Carried) else 1
-        built = cross(placed.grid, function, control.points, options, self.prepared.system.periods, expected)
+        points = control.points, control.moving
+        built = cross(placed.grid, function, points, options, self.prepared.system.periods, expected)
         self._edges = built.train.edges()
         error = difference(built.train.evaluate, function, control)
         rank = max(built.train.ranks)
@@ -131,4 +131,4 @@ def difference(one: Callable[[Array], Array], other: Callable[[Array], Array], c
     if not top > 0:
         return np.inf
     relative = np.abs(one(control.points) - values) / np.maximum(values, FLOOR * top)
-    return float(control.weights @ (relative * np.maximum(control.distances(), 1.0)))
+    return float(control.moving @ relative)

@@ -88,16 +88,20 @@ class Mass(NamedTuple):
         unit = P / np.outer(scale, scale) + 1e-9 * np.eye(len(P))
         return np.asarray(np.sqrt(np.sum(apart * np.linalg.solve(unit, apart), axis=0) / len(P)))
 
+    @property
+    def moving(self) -> Array:
+        """How much the points (P,) count for the mean: their mass, times their distance in deviations where that is above one."""
+        return np.asarray(self.weights * np.maximum(self.distances(), 1.0))
+
     def control(self, count: int, tolerance: float) -> Mass:
         """Return points for checks, with weights: most in proportion to what they move the mean, the others to root of the mass.
 
         They are drawn in the order of their distance from the mean, so that a part of little mass far from the others has its
         share of them; the farthest of the heavy ones are among them.
         """
-        distances, root = self.distances(), np.sqrt(self.weights)
-        moved = self.weights * np.maximum(distances, 1.0)
-        chance = 0.7 * moved / moved.sum() + 0.3 * root / root.sum()
-        order = np.argsort(distances, kind="stable")
+        moving, root = self.moving, np.sqrt(self.weights)
+        chance = 0.7 * moving / moving.sum() + 0.3 * root / root.sum()
+        order = np.argsort(self.distances(), kind="stable")
         places = (np.arange(count) + 0.5) / count
         drawn = order[np.minimum(np.searchsorted(np.cumsum(chance[order]), places), len(chance) - 1)]
         far = order[self.heavy(tolerance)[order]][-FAR:]

@@ -25,6 +25,7 @@ Array = Any
 SEEDS, FEWEST_SEEDS = 2, 6  # points of the mass in the sets of the first sweep beyond the rank that is expected, and at least
 KEPT_GAIN = 0.7  # ratio of the errors of two sweeps above which another one gains too little
 MOST_SWEEPS, CAPPED_SWEEPS = 6, 2  # and where a rank meets its limit: more sweeps do not make up for it
+FLOOR = 1e-4  # of the largest value, below which errors do not count relative to the value
 WORST = 8  # control points with the largest errors that join the sets: the rank can grow by so many in a sweep
 
 
@@ -108,37 +109,41 @@ class _Cross:
         return [self.fibres(0), *cores[::-1]]
 
 
-def cross(grid: Grid, function: Function, control: Array, options: Options, periods: Array, expected: int = 1) -> Built:
+def cross(
+    grid: Grid, function: Function, control: tuple[Array, Array], options: Options, periods: Array, expected: int = 1
+) -> Built:
     """Return a function on a grid as a train.
 
     Args:
         grid: the grid.
         function: the function.
-        control: points (n, P) of its mass; the values at the nearest points of the grid decide how many sweeps are made.
+        control: points (n, P) of its mass, and how much each counts (P,); the errors at the nearest points of the grid, relative
+            to the values there, decide how many sweeps are made.
         options: the accuracy.
         periods: (n,), 2 pi for angles and 0 for other states.
         expected: the rank that is expected.
     """
-    n, index = grid.n, grid.index_of(control)
+    points, counts = control
+    n, index = grid.n, grid.index_of(points)
     values = function(grid.x_of(grid.low[:, None] + grid.step[:, None] * index.T))
     order = np.argsort(-np.abs(values), kind="stable")
     seeds = index[order[np.linspace(0, len(order) // 2, max(FEWEST_SEEDS, min(expected + SEEDS, options.most_rank))).astype(int)]]
     left = [np.zeros((1, 0), np.int64)] * (n + 1)
     right = [*(seeds[:, k:] for k in range(n)), np.zeros((1, 0), np.int64)]
     work = _Cross(grid, function, options, left, right, len(index))
-    size = np.maximum(np.abs(values), 1e-2 * np.abs(values).max())
+    counts = counts / np.maximum(np.abs(values), FLOOR * np.abs(values).max())
     last, sweep = math.inf, 0
     while True:
         cores = work.sweep_left() if sweep % 2 else work.sweep_right()
         train = Train(grid, tuple(map(np.ascontiguousarray, cores)), periods)
-        errors = np.abs(train.on_grid(index) - values) / size
-        error = float(errors.mean())
+        errors = np.abs(train.on_grid(index) - values) * counts
+        error = float(errors.sum())
         sweep += 1
         most = CAPPED_SWEEPS if work.capped else MOST_SWEEPS
         if error < options.enough * options.tolerance or error > KEPT_GAIN * last or sweep >= most:
             return Built(train, work.evaluations, sweep, error, work.capped)
         last = error
-        worst = index[np.argsort(-errors * size, kind="stable")[:WORST]]
+        worst = index[np.argsort(-errors, kind="stable")[:WORST]]
         for k in range(1, n):
             if sweep % 2:  # a sweep to the right comes next to the left, and takes the sets of the left
                 work.left[k] = np.concatenate([work.left[k], worst[:, :k]])
