@@ -368,3 +368,44 @@ def test_a_coefficient_that_never_changes_is_named_where_the_record_is_longer_th
     )  # fmt: skip
     record = record_of(model, 66, 0.1, gaps=False)
     assert any("b never changes" in line for line in zakai.filter(model, record, PARTICLES, particles=50).warnings)
+
+
+def means_of_draws(drift, start, times, noise, steps_per_unit, seed):
+    """Means of a state at times, of draws that are moved in short steps."""
+    rng, x, t, found = np.random.default_rng(seed), start, 0.0, []
+    for stop in times:
+        count = int(np.ceil((stop - t) * steps_per_unit))
+        step = (stop - t) / count
+        for j in range(count):
+            middle = x + 0.5 * step * drift(x, t + j * step)
+            x = x + step * drift(middle, t + (j + 0.5) * step) + noise * x * np.sqrt(step) * rng.standard_normal(len(x))
+        t = stop
+        found.append(x.mean())
+    return np.array(found)
+
+
+def test_a_stiff_fall_after_an_input_has_jumped_is_followed():
+    model = zakai.Model(
+        state=["s"], drift=["u - 30*s/(0.3 + s)"], diffusion=[["0.1*s"]], observation=["s"], observation_kind="samples",
+        observation_noise=[["100"]], inputs=["u"], domain={"s": {"lower": 0.0}},
+        prior={"kind": "gaussian", "mean": [0.5], "cov": [0.0025]},
+    )  # fmt: skip
+    times = [0.5, 1.0, 1.5, 2.0, 2.06]
+    inputs = zakai.Inputs([0.0, 1.999], [[20.0], [2.0]])
+    record = zakai.Record(times, np.zeros((len(times), 1)), "samples", inputs=inputs)
+    result = zakai.filter(model, record, PARTICLES, particles=4000)
+    start = 0.5 + 0.05 * np.random.default_rng(0).standard_normal(4000)
+    known = means_of_draws(lambda s, t: (20.0 if t < 1.999 - 1e-9 else 2.0) - 30 * s / (0.3 + s), start, times, 0.1, 1000, 1)
+    assert np.allclose(result.mean[1:, 0], known, atol=0.2 * np.sqrt(result.variance[1:, 0]))
+
+
+def test_the_time_error_between_two_modes_does_not_grow_where_no_particle_is():
+    prior = {"kind": "gaussian", "mean": [0.0], "cov": [1.0]}
+    model = zakai.Model(
+        state=["x"], drift=["4*x - 4*x**3"], diffusion=[["0.5"]], observation=["x**2"], observation_kind="samples",
+        observation_noise=[["0.1"]], prior=prior,
+    )  # fmt: skip
+    record = zakai.Record(np.arange(1, 31) * 0.3, np.ones((30, 1)), "samples")
+    result, exact = zakai.filter(model, record, PARTICLES, particles=2000), zakai.filter(model, record, "yau-yau")
+    assert np.abs(result.mean - exact.mean).max() < 0.15
+    assert np.nanmax(result.health["time_error"]) < 0.1

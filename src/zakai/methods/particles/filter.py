@@ -34,6 +34,7 @@ from zakai.methods.particles.interval import (
     Pilots,
     Scheme,
     Steps,
+    carried_shift,
     steps_of,
     with_update,
 )
@@ -46,7 +47,7 @@ from zakai.numerics.particles.chunks import over_chunks
 from zakai.numerics.particles.population import effective, next_power, normalised, systematic
 from zakai.numerics.particles.random import normals, uniform_number
 
-NOISE, RESAMPLING, PILOT, GUIDE, MOVE, PRIOR, LEVELS = range(7)  # uses of random numbers
+NOISE, RESAMPLING, PILOT, GUIDE, MOVE, PRIOR, LEVELS, CARRY = range(8)  # uses of random numbers
 RESAMPLE_BELOW = 0.5  # effective share of the particles
 GUIDE_BELOW = 0.3  # effective share below which the noise is drawn again from the linearised posterior
 TEMPER_BELOW, TEMPER_FLOOR = 0.1, 400  # effective share and number below which powers of the likelihood are taken
@@ -70,8 +71,10 @@ VARIANCE = 5.0  # that of a mean times N, in variances of the state, that the nu
 MOST_GROWTH = 4
 REPEATED, NARROWEST = 2.0, 0.02  # excess of the time error at which an interval is repeated, and least narrowing that counts
 # Of the time error: the share of the allowed one below which it holds in so many more intervals, in how many it does where it was
-# no more than so many times the substeps that were expected, and the ratio of errors by length up to which it holds.
-SURE, TRUSTED, TRUSTED_LESS, FORESEEN, LONGER = 0.5, 4, 1, 1.3, 4.0
+# no more than so many times the substeps that were expected, and the ratio of errors by length up to which it holds.  It does not
+# where the drift moves the mean by more than a deviation in the interval, and so many times as fast as where it was measured.
+SURE, TRUSTED, TRUSTED_LESS, FORESEEN, LONGER, FASTER = 0.5, 4, 1, 1.3, 4.0, 2.0
+CARRIED = 64  # particles by which a shift of the mean is carried through an interval
 
 
 def init(prepared: Prepared, prior: Any) -> State:
@@ -97,7 +100,7 @@ def _at_start(prepared: Prepared, particles: Array, first: Array, gaussian: tupl
     width = system.law.width if system.law is not None else system.factor.width  # type: ignore[union-attr]
     window = Window.begin(particles, first, gaussian, (width, len(prepared.motion.law[3])))
     logs, nothing = np.full(count, -np.log(count)), np.zeros(system.n)
-    control = Control(0, 1, 4, 0.0, 0.0, 0, 1.0, VARIANCE, 0.0, 0.0, 0.0, 0.0, 1.0, 0, 0.0)
+    control = Control(0, 1, 4, 0.0, 0.0, 0, 1.0, VARIANCE, 0.0, 0.0, 0.0, 0.0, 1.0, 0, 0.0, 0.0)
     return State(particles, logs, window, Genealogy.begin(count), control, nothing, nothing, np.ones(system.n))
 
 
@@ -229,7 +232,7 @@ def _step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[Stat
     spread = np.sqrt(np.maximum(np.diag(cov), 0.0))
     # What the weights say of a coordinate makes a shift of the prediction smaller by the ratio of the variances.
     contraction = np.where(done.predicted > 0, np.minimum(1.0, own / np.maximum(done.predicted, 1e-300)) ** 2, 1.0)
-    shift = _carried(motion, events, before, state.shift) + steps.shift
+    shift = (_carried(prepared, events, state) if state.shift.any() else 0.0) + steps.shift
     # A shifted prediction changes the log density of an observation by the shift times an innovation.
     known = np.maximum(done.deviations, 1e-300)
     shifted = control.shifted + float(((shift[:n] / known) ** 2 * (1.0 - contraction[:n])).max())
@@ -277,12 +280,14 @@ def _steps(
     if length <= 0:
         return Steps(Scheme(1, 4), np.zeros(len(mean)), 0.0, 0.0), control
     # The error of an interval is of the third order of its length, and was measured in deviations of that time.
-    ratio = (length / control.length) ** 3 if control.length and not interval.inputs_change(hold) else np.inf
+    jumps, pace = interval.inputs_change(hold), prepared.motion.pace(interval, values, mean, scale)
+    ratio = (length / control.length) ** 3 if control.length and not jumps else np.inf
     ratio *= max(1.0, float((state.last_scale / scale).max()))
     allowed = _allowed(control, len(state.log_weights))
     needed = control.substeps * np.sqrt(control.error * ratio / allowed)
     guess = max(1, int(np.ceil(needed))) if needed <= MOST_SUBSTEPS else max(1, control.substeps)
-    if control.trusted and ratio <= LONGER and guess <= MOST_SUBSTEPS:
+    alike = pace * length <= 1.0 or pace <= FASTER * control.pace
+    if control.trusted and alike and ratio <= LONGER and guess <= MOST_SUBSTEPS:
         ratio *= (control.substeps / guess) ** 2
         error = control.error * ratio
         known = Steps(Scheme(guess, control.stages), state.last_shift * ratio, error, error, False)
@@ -295,16 +300,15 @@ def _steps(
     count, stages = found.scheme
     expected = count * np.sqrt(found.error / allowed) <= FORESEEN * needed
     trusted = TRUSTED if found.surely <= SURE * allowed else TRUSTED_LESS if expected else 0
-    return found, control._replace(substeps=count, stages=stages, error=found.error, length=length, trusted=trusted)
+    trusted = 0 if jumps else trusted  # of other inputs than those that the next interval begins with
+    return found, control._replace(substeps=count, stages=stages, error=found.error, length=length, trusted=trusted, pace=pace)
 
 
-def _carried(motion: Motion, events: Events, mean: Array, shift: Array) -> Array:
-    """Return a shift of the mean (n,) after an interval without noise."""
-    if not shift.any():
-        return shift
-    pair, _ = motion.advanced(events, np.column_stack([mean, mean + shift]), np.zeros((events.width, 2)))
-    found = pair[:, 1] - pair[:, 0]
-    return np.where(np.isfinite(found), found, shift)
+def _carried(prepared: Prepared, events: Events, state: State) -> Array:
+    """Return what the shift of the mean (n,) becomes in an interval."""
+    chosen = np.empty(CARRIED, np.int32)
+    systematic(np.exp(state.log_weights), uniform_number(prepared.key(state.control.interval + 1, CARRY)), chosen)
+    return carried_shift(prepared.motion, events, taken(state.particles, chosen), state.shift)
 
 
 def _observed(prepared: Prepared, interval: Interval, values: Array) -> Observed:

@@ -22,6 +22,7 @@ PILOTS = 128  # particles by which the time step is measured
 # standard error of a mean where that is more, up to a largest one.
 TIME_ERROR, OF_RANDOM_ERROR, MOST_TIME_ERROR = 0.005, 0.1, 0.1
 MOST_SUBSTEPS = 64
+LEAST_CONTRACTION = 0.02  # ratio of deviations at the end and the start of an interval, below which errors are not judged by it
 EXACT = 1e-3  # relative error of the flow of an affine system without time that is not measured
 KEPT_LENGTHS = 64  # of substeps whose noise is kept
 # Norm of df/dx times a substep above which it is reduced where f is not linear: noise that is carried far to the middle of a
@@ -181,6 +182,12 @@ class Motion:
         f = self.values(self.arrays[0], points.reshape(n, -1), t, given)[:n].reshape(n, count, n + 1)
         found = ((f[:, :, 1:] - f[:, :, :1]) / step).transpose(1, 0, 2)
         return np.where(np.isfinite(found), found, 0.0)
+
+    def pace(self, interval: Interval, values: Array, mean: Array, scale: Array) -> float:
+        """Return the largest drift of a mean (n,) at the start of an interval, in deviations (n,) by time."""
+        given = self.given_numbers(interval, np.array([[interval.start, interval.stop]]), values)
+        f = self.values(self.arrays[0], mean[:, None], interval.start, given[0, 0])[: len(mean), 0]
+        return float(np.nan_to_num(np.abs(f) / scale, nan=np.inf).max())
 
     def events(self, interval: Interval, scheme: Scheme, values: Array, mean: Array, scale: Array) -> Events:
         """Return the events of an interval in equal substeps.
@@ -394,6 +401,10 @@ def _time_errors(
     y, finer = motion.advanced(fine, pilots.states, noise)
     centred = y - y.mean(axis=1, keepdims=True)
     spread = np.maximum(centred.std(axis=1), 1e-9 * scale)
+    # What contracts in the interval is judged by the deviation at its end.
+    began = pilots.states.std(axis=1)
+    contracted = np.divide(spread, began, out=np.ones(len(began)), where=began > 0)
+    judged = scale * np.clip(contracted, LEAST_CONTRACTION, 1.0)
 
     def change(stages: int) -> tuple[float, Array, float]:
         places = coarse.places.copy()
@@ -406,11 +417,25 @@ def _time_errors(
         parts = (d, d * centred / spread[:, None], weighted)
         squares, noise = (np.array([f(part) for part in parts]) for f in (_squared_mean, _variance_of_mean))
         # What the number of pilots adds to a mean of zero is not subtracted: few cannot show that there is no error.
-        largest = np.sqrt(squares.max(axis=0)) / scale
-        surely = np.sqrt((squares + noise).max(axis=0)) / scale
+        largest = np.sqrt(squares.max(axis=0)) / judged
+        surely = np.sqrt((squares + noise).max(axis=0)) / judged
         return 4 / 3 * float(largest.max()), 4 / 3 * (d + weighted).mean(axis=1), 4 / 3 * float(surely.max())
 
     return change(2), change(4)
+
+
+def carried_shift(motion: Motion, events: Events, x: Array, shift: Array) -> Array:
+    """Return what a shift (n,) of particles x (n, N) becomes in the mean after an interval, without noise.
+
+    Between two modes the path of the mean itself would be unstable where no particle is.
+    """
+    count, angles = x.shape[1], motion.system.angles
+    both = np.concatenate([x, x + shift[:, None]], axis=1)
+    ends, _ = motion.advanced(events, both, np.zeros((events.width, 2 * count)))
+    apart = ends[:, count:] - ends[:, :count]
+    apart[angles] = np.remainder(apart[angles] + np.pi, 2 * np.pi) - np.pi
+    found = apart.mean(axis=1)
+    return np.where(np.isfinite(found), found, shift)
 
 
 def _squared_mean(part: Array) -> Array:

@@ -19,11 +19,12 @@ from zakai.records.schedule import Schedule
 class Control(NamedTuple):
     """What decides the next step beside the particles.
 
-    `interval` counts intervals; `substeps` with `stages`, whose `error` was measured in an interval of this `length`, and is
-    `trusted` in so many more; `narrow` the ratio of the deviations after and before the last
-    observation, `variance` of a mean times N, `losses` the sum of its means and `work` that of steps and moves, `excess` what has
-    added up since the last move beyond `floor`, what that has left, `rate` its acceptance, `doubtful_until` the number of
-    resamplings until which standard errors are lower bounds, and `shifted` the variance of the log-likelihood by the time step.
+    `interval` counts intervals; `substeps` with `stages`, whose `error` was measured in an interval of this `length`, where the
+    drift moved the mean at this `pace`, and is `trusted` in so many more; `narrow` the ratio of the deviations after and before
+    the last observation, `variance` of a mean times N, `losses` the sum of its means and `work` that of steps and moves,
+    `excess` what has added up since the last move beyond `floor`, what that has left, `rate` its acceptance, `doubtful_until`
+    the number of resamplings until which standard errors are lower bounds, and `shifted` the variance of the log-likelihood by
+    the time step.
     """
 
     interval: int
@@ -41,6 +42,7 @@ class Control(NamedTuple):
     rate: float
     doubtful_until: int
     shifted: float
+    pace: float
 
 
 class State(NamedTuple):
