@@ -59,13 +59,14 @@ MOST_LEVELS = 60
 FAR = 1e100  # a state that has left every bounded set
 FEW_FAMILIES = 20  # of the oldest generation that is looked back to, below which they are too few to show their spread
 # The past is moved where that pays: by error^2 x time, with N variance of a mean, in variances of the state, as error^2.  What
-# ancestors add to that, beyond what the last move left, grows about linearly, so that a move takes twice as much away from later
-# steps as has added up since the last one.  That is compared with its cost, both as shares of all so far.  A move waits until it
-# can divide the present loss by `MOVE_GAIN`, and longer where the last one had gained less; what that left is forgotten at a
-# rate.  The cost is counted in normal numbers: those of the window, once and for each sweep by the acceptance of the last move,
-# and in a step its own and as many as the rest of it takes.  (Measured on seven systems: 30 to 38 ns a number in a move, 0.3 us
-# and 40 ns a number in a step.)
-MOVE_GAIN, FORGOTTEN, STEP_WORK, LEAST_RATE = 1.5, 0.98, 8.0, 0.3
+# ancestors add to that, beyond what the last move left, is taken away from later steps, and as the ancestors that are lost before
+# a move cannot come back, `MOVE_WORTH` times as much as has added up since the last one counts (error^2 x time of eleven systems
+# is about equal with 8, that of most is more with 2).  That is compared with its cost, both as shares of all so far.  A move
+# waits until it can divide the present loss by `MOVE_GAIN`, and longer where the last one had gained less; what that left is
+# forgotten at a rate.  The cost is counted in normal numbers: those of the window, once and for each sweep by the acceptance of
+# the last move, and in a step its own and as many as the rest of it takes.  (Measured on seven systems: 30 to 38 ns a number in a
+# move, 0.3 us and 40 ns a number in a step.)
+MOVE_GAIN, MOVE_WORTH, FORGOTTEN, STEP_WORK, LEAST_RATE = 1.5, 4.0, 0.98, 8.0, 0.3
 MOVE_CONTROL = (1.0, 1.2, 4.0, 0.4, 1.0)  # power, change, most sweeps, rho, share
 VARIANCE = 5.0  # that of a mean times N, in variances of the state, that the number of particles is chosen for
 MOST_GROWTH = 4
@@ -220,7 +221,7 @@ def _step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[Stat
     floor, excess = FORGOTTEN * control.floor, control.excess + max(loss - own_loss - control.floor, 0.0)
     losses, work, rate = control.losses + loss, control.work + STEP_WORK + len(done.noise), control.rate
     cost = cloud.window.width * (1.0 + MOVE_CONTROL[1] / max(rate, LEAST_RATE))
-    if loss > MOVE_GAIN * (own_loss + floor) and 2.0 * excess * work > cost * losses and cloud.window.width:
+    if loss > MOVE_GAIN * (own_loss + floor) and MOVE_WORTH * excess * work > cost * losses and cloud.window.width:
         cloud, acceptance, doubtful_move = _moved(prepared, cloud, weights, number)
         weights = np.exp(cloud.logs)
         mean, deviations, cov, own = moments_of(system, cloud.particles, weights)
