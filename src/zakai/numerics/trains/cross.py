@@ -24,7 +24,7 @@ from zakai.numerics.trains.train import Train
 Array = Any
 SEEDS, FEWEST_SEEDS = 2, 6  # points of the mass in the sets of the first sweep beyond the rank that is expected, and at least
 KEPT_GAIN = 0.7  # ratio of the errors of two sweeps above which another one gains too little
-MOST_SWEEPS, CAPPED_SWEEPS = 6, 2  # and where a rank meets its limit: more sweeps do not make up for it
+MOST_SWEEPS, CAPPED_SWEEPS = 6, 2  # and where a rank meets its limit: more sweeps gain little there
 FLOOR = 1e-4  # of the largest value, below which errors do not count relative to the value
 WORST = 8  # control points with the largest errors that join the sets: the rank can grow by so many in a sweep
 
