@@ -91,6 +91,21 @@ def test_the_time_in_which_kernels_are_compiled_does_not_end_the_measurement():
     assert compilation_time() - before > 0.4
 
 
+def test_the_time_is_not_over_in_a_callback_of_the_garbage_collection(monkeypatch):
+    def slow(phase: str, info: object) -> None:
+        ends = time.monotonic() + 0.2
+        while time.monotonic() < ends:
+            pass
+        ended.append(phase)
+
+    ended: list[str] = []
+    monkeypatch.setattr(gc, "callbacks", [slow])
+    with pytest.raises(ZakaiError, match="more than 0.05 s"), expected_time._at_most(0.05):
+        gc.callbacks[0]("start", None)
+        time.sleep(2.0)
+    assert ended == ["start"]
+
+
 def test_blocks_add_their_times_and_the_record_is_not_filtered_as_a_whole(monkeypatch):
     model = zakai.load_model("gallery:benes-2d")
     _, record = zakai.simulate(model, 0.01 * np.arange(1, 2001), seed=0)

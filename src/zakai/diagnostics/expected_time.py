@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import gc
 import signal
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from types import FrameType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -164,9 +166,9 @@ def _at_most(seconds: float) -> Iterator[None]:
 
     ends = working_time() + seconds
 
-    def late(*_: Any) -> None:
+    def late(_: int, frame: FrameType | None) -> None:
         left = ends - working_time()
-        if compiling() or left > 0.0:
+        if compiling() or left > 0.0 or _collecting(frame):
             signal.setitimer(signal.ITIMER_REAL, max(left, AGAIN))
             return
         raise _LateError(f"more than {seconds:g} s")
@@ -178,3 +180,13 @@ def _at_most(seconds: float) -> Iterator[None]:
     finally:
         signal.setitimer(signal.ITIMER_REAL, 0.0)
         signal.signal(signal.SIGALRM, before)
+
+
+def _collecting(frame: FrameType | None) -> bool:
+    """Return whether a frame belongs to a callback of the garbage collection, in which an error would be ignored."""
+    callbacks = {getattr(callback, "__code__", None) for callback in gc.callbacks}
+    while frame is not None:
+        if frame.f_code in callbacks:
+            return True
+        frame = frame.f_back
+    return False

@@ -65,6 +65,7 @@ ADVICE = {
     "aliasing": _COMPARE,
     "splitting_error": _COMPARE,
     "outside_tables": "extend the table",
+    "unknown_draws": "compare with the method guided-particles",
     "without_law": "change the formula of the observation where it has no value",
     "mean_error": _MORE_COMPONENTS,
     "deviation_error": _MORE_COMPONENTS,
