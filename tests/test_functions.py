@@ -1,4 +1,4 @@
-"""A function has at most eight arguments: more of them are fields of a tuple or a class with a name."""
+"""A function has at most eight arguments, more of them are fields of a tuple or a class with a name; a file at most 500 lines."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 import zakai
 
 SOURCE = Path(zakai.__file__).parent
-MOST = 8
+MOST, LONGEST = 8, 500
 # The signatures of public functions and of commands are what users call, with keywords.
 PUBLIC = {"zakai.inference.bayes.sample", "zakai.models.model.__init__"}
 WITHOUT = ("cli", "peers", "studies")
@@ -44,3 +44,8 @@ def test_functions_have_at_most_eight_arguments():
 def test_a_function_with_nine_arguments_is_found():
     nine = "def f(a, b, c, d, /, e, f, *, g, h, i): ...\nclass C:\n    def g(self, a, b, c, d, e, f, g, h): ..."
     assert long_functions(nine, "m") == ["m.f"]
+
+
+def test_files_have_at_most_500_lines():
+    lengths = {path.relative_to(SOURCE).as_posix(): len(path.read_text().splitlines()) for path in SOURCE.rglob("*.py")}
+    assert len(lengths) > 400 and {name: length for name, length in lengths.items() if length > LONGEST} == {}

@@ -22,8 +22,9 @@ from zakai.methods.line.backward_interval import negligible, pulled, smoothing_t
 from zakai.methods.line.backward_loop import back
 from zakai.methods.line.loop import joined
 from zakai.methods.line.message import Message, points_of, reliable
+from zakai.methods.line.parts import cut
 from zakai.methods.line.paths import draw
-from zakai.methods.line.prepared import Parts, Prepared, State, cut
+from zakai.methods.line.prepared import Parts, Prepared, State
 from zakai.methods.line.update import acting_inside, factor_of, state_moments, state_of
 from zakai.numerics.line import window as lw
 from zakai.numerics.line.density import support

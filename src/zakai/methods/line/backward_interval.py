@@ -19,7 +19,8 @@ from zakai.methods.line.gauged import by_fixed_grids, by_moving_grid
 from zakai.methods.line.kernel import kernel_of
 from zakai.methods.line.message import MOST_GRIDS, Message, covering, gauged, points_of, reliable, taper
 from zakai.methods.line.prepared import Prepared, State, TimeInterval
-from zakai.methods.line.transition import MOST_SUBSTEPS, Report, Substep, parts_of_split, travel, trial_substep
+from zakai.methods.line.report import Report
+from zakai.methods.line.transition import MOST_SUBSTEPS, Substep, parts_of_split, travel, trial_substep
 from zakai.methods.line.volumes import WIDENINGS, cell_plan_of, ends_of, pulled_back
 from zakai.numerics.line import window as lw
 from zakai.numerics.line.backward import EXCURSION, FEWEST, ROUNDING

@@ -16,7 +16,8 @@ import numpy as np
 from zakai.methods.line.coefficients import on_grid_for_drift
 from zakai.methods.line.kernel import by_kernel, kernel_of
 from zakai.methods.line.prepared import Prepared, TimeInterval
-from zakai.methods.line.transition import MOVING, Prediction, Report, by_decomposition, by_substeps, travel
+from zakai.methods.line.report import Report
+from zakai.methods.line.transition import MOVING, Prediction, by_decomposition, by_substeps, travel
 from zakai.methods.line.update import refitted
 from zakai.methods.line.volumes import contracted
 from zakai.numerics.line import window as lw

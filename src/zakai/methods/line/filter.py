@@ -25,8 +25,10 @@ from zakai.methods.line import loop
 from zakai.methods.line.choice import predicted
 from zakai.methods.line.domain import check_ends, check_escape, on_the_line, variable_of
 from zakai.methods.line.model import system_of
-from zakai.methods.line.prepared import NOISE, SHARED, Parts, Prepared, State, parts_of_step, segment_of_parts
-from zakai.methods.line.transition import RecordedTransition, Report
+from zakai.methods.line.parts import parts_of_step, segment_of_parts
+from zakai.methods.line.prepared import NOISE, SHARED, Parts, Prepared, State
+from zakai.methods.line.report import Report
+from zakai.methods.line.transition import RecordedTransition
 from zakai.methods.line.update import (
     acting_inside,
     edge_of_moments,

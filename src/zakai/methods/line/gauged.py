@@ -22,10 +22,10 @@ from zakai.methods.line.coefficients import coefficients, covariance_at, resolve
 from zakai.methods.line.message import MOST_GRIDS, SURE, Message, reliable
 from zakai.methods.line.model import finite
 from zakai.methods.line.prepared import Prepared, State, TimeInterval
+from zakai.methods.line.report import Report
 from zakai.methods.line.transition import (
     MOST_SUBSTEPS,
     Coefficients,
-    Report,
     Substep,
     Trial,
     by_substeps,

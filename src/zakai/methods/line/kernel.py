@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 
 from zakai.methods.line.prepared import Prepared, TimeInterval
-from zakai.methods.line.transition import Prediction, Report
+from zakai.methods.line.report import Report
+from zakai.methods.line.transition import Prediction
 from zakai.numerics.line import window as lw
 from zakai.numerics.line.gaussian_kernels import WIDE, Channel, applied, around, chosen, wrapped
 from zakai.numerics.line.resolution import noise_bound

@@ -20,7 +20,8 @@ from zakai.methods.line import filter as line_filter
 from zakai.methods.line.backward_loop import log_likelihoods
 from zakai.methods.line.coefficients import spectral
 from zakai.methods.line.loop import DIVIDED, START, Piece, grid_of, infos_of
-from zakai.methods.line.prepared import Parts, Prepared, State, segment_of_parts
+from zakai.methods.line.parts import segment_of_parts
+from zakai.methods.line.prepared import Parts, Prepared, State
 from zakai.methods.line.transition import RecordedTransition, Substep, exponents_of
 from zakai.methods.line.update import factor_of
 from zakai.numerics.complex_step import STEP

@@ -33,6 +33,7 @@ from zakai.methods.line.domain import lost
 from zakai.methods.line.modal import coarsened
 from zakai.methods.line.model import finite
 from zakai.methods.line.prepared import NOISE, Prepared, TimeInterval
+from zakai.methods.line.report import Report
 from zakai.methods.line.update import refitted
 from zakai.numerics.line import window as lw
 from zakai.numerics.line.averages import GAUSS_NODES, GAUSS_WEIGHTS
@@ -42,11 +43,9 @@ from zakai.numerics.line.product import finer
 from zakai.numerics.line.resolution import (
     GROSS,
     LOST_MASS,
-    RELIABLE,
     SPECTRUM_FACTOR,
     TRANSITION_SHARE,
     edge_bound,
-    error_made,
     noise_bound,
     rounding_bound,
     spectrum_bound,
@@ -297,46 +296,6 @@ def by_modes(prepared: Prepared, values: Array, window: lw.Window, length: float
 
 MOST_SUBSTEPS = 4000
 FEW = 24  # substeps of an interval, after which no large grid is used
-
-
-class Report:
-    """The worst health figures within one step."""
-
-    def __init__(self) -> None:
-        self.aliasing = self.edge = self.time = self.noise = self.depth = self.growth = self.negative = self.lawless = 0.0
-        self.positive = True  # small values are accurate
-        self.decomposed = True  # the operator has a decomposition on the grid that serves every interval
-
-    def density(self, check: lw.GridCheck) -> None:
-        """Note the figures of a density."""
-        self.aliasing = max(self.aliasing, check.aliasing)
-        self.negative = max(self.negative, check.negative)
-        self.edge = max(self.edge, check.left, check.right)
-
-    def figures(self, prepared: Prepared, floor: float, before: float, spacings: float) -> tuple[float, dict[str, float]]:
-        """Return the error estimate after a step and its health figures.
-
-        Args:
-            prepared: the system.
-            floor: the error of small values of the prediction, relative to the maximum.
-            before: the remainder of the error before the step.
-            spacings: the standard deviation of the density, in spacings.
-        """
-        made = error_made(self.aliasing, self.edge, self.negative, self.time, floor * self.growth)
-        error = float(max(made + before, RELIABLE * prepared.promised))
-        health = {
-            "error_estimate": error,
-            "tolerance_ratio": made / prepared.promised,
-            "edge_mass": self.edge,
-            "negative_mass": self.negative,
-            "aliasing": self.aliasing,
-            "time_error": self.time,
-            "tail_depth": self.depth / prepared.deepest(floor),
-            "std_in_spacings": spacings,
-        }
-        if prepared.system.general:
-            health["without_law"] = self.lawless
-        return error, health
 
 
 class RecordedTransition(NamedTuple):

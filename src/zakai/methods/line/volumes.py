@@ -16,7 +16,8 @@ from zakai.methods.line.coefficients import coefficients, covariance_at, resolve
 from zakai.methods.line.domain import ends_of_leak
 from zakai.methods.line.model import finite, within
 from zakai.methods.line.prepared import Prepared, TimeInterval
-from zakai.methods.line.transition import Prediction, Report
+from zakai.methods.line.report import Report
+from zakai.methods.line.transition import Prediction
 from zakai.numerics.line import window as lw
 from zakai.numerics.line.averages import GAUSS_NODES, Panels, interpolation
 from zakai.numerics.line.resolution import RESOLVED, ROUNDING, SUPPORT, TRANSITION_SHARE

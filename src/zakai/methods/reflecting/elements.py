@@ -19,7 +19,7 @@ from zakai.errors import InputError
 from zakai.methods.line.cache import Derived
 from zakai.methods.line.coefficients import covariance_at, offset_of, potential_of, precision_of, tables
 from zakai.methods.line.prepared import Prepared, TimeInterval
-from zakai.methods.line.transition import Report
+from zakai.methods.line.report import Report
 from zakai.methods.line.volumes import advanced_by, cell_plan_of, kinks_between
 from zakai.models.domain import Interval
 from zakai.numerics.line.averages import GAUSS_NODES, GAUSS_WEIGHTS

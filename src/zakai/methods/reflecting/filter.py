@@ -17,7 +17,7 @@ from zakai.errors import InputError
 from zakai.methods._protocol import Info
 from zakai.methods.line.domain import check_escape
 from zakai.methods.line.prepared import NOISE, Prepared
-from zakai.methods.line.transition import Report
+from zakai.methods.line.report import Report
 from zakai.methods.line.update import error_remainder, factor_at_end, outside_tables, spread
 from zakai.methods.reflecting.elements import (
     SAMPLES,
