@@ -1,4 +1,4 @@
-"""Systems of three to six coupled states: `tensor-train` against a bootstrap filter in NumPy, error and time.
+"""Systems of three to six coupled states: `auto` and `tensor-train` against a bootstrap filter in NumPy, error and time.
 
     python benchmarks/several_states.py [NAME ...] [--particles 100000] [--reference 1000000] [--tolerance 5e-3]
 
@@ -188,17 +188,17 @@ def main():
         sd = np.sqrt(np.einsum("kii->ki", known["cov"]))
         spread = np.sqrt(((known["apart"] / sd) ** 2).mean())
         print(f"{name} ({model.n}): reference +- {spread:.1e} sd, {known['logs']:.2f} log", flush=True)
-        for tolerance in args.tolerance:
+        for method, tolerance in [("auto", None), *(("tensor-train", tolerance) for tolerance in args.tolerance)]:
             took = []
             for _ in range(3):
                 begin = time.process_time()
-                result = zakai.filter(model, record, "tensor-train", tolerance=tolerance)
+                result = zakai.filter(model, record, method, **({} if tolerance is None else {"tolerance": tolerance}))
                 took.append(1e3 * (time.process_time() - begin) / len(when))
             words = errors(result.mean[1:], result.cov[1:], known, model)
             health = {key: float(np.nanmax(np.asarray(value))) for key, value in result.health.items()}
             figures = ", ".join(f"{key} {value:.2g}" for key, value in health.items())
             apart = result.log_likelihood - known["log"]
-            print(f"  tensor-train {tolerance}: {took[0]:.1f} then {min(took[1:]):.1f} ms, {words}, log {apart:+.3f}")
+            print(f"  {result.method} {tolerance}: {took[0]:.1f} then {min(took[1:]):.1f} ms, {words}, log {apart:+.3f}")
             print(f"    {figures}\n    {result.warnings}", flush=True)
         if args.particles:
             begin = time.process_time()
