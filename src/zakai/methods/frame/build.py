@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from zakai.methods.frame.placement import Mass, Placed, Rule, closed_axes, place, with_spacing
-from zakai.methods.frame.state import Prepared
+from zakai.methods.frame.state import Prepared, Unresolved
 from zakai.methods.particles.programs import Array
 from zakai.numerics.trains.carried import Carried
 from zakai.numerics.trains.cross import FLOOR, Options, cross
@@ -94,6 +94,8 @@ class Builder:
             function = function.about(np.where(angles, mass.points @ mass.weights, np.nan))
         closed = closed_axes(mass, angles, rule)
         grid, D = place(function, mass, closed, rule, noise, stretch)
+        if not (np.isfinite(grid.step).all() and np.isfinite(grid.basis).all() and np.isfinite(grid.low).all()):
+            raise Unresolved("the points of a density have no finite bounds")
         control = mass.control(CONTROLS, rule.tolerance)
         found, report = self._crossed(Placed(grid, D), function, control, options)
         out = (self._edges > EDGE * rule.tolerance) & ~closed

@@ -35,6 +35,7 @@ STRETCHES = (1.0, 1.35, 1.8)  # of a box, while the mass of a motion differs fro
 DEFECT = 3.0  # tolerances of mass that a motion may lose or gain before its box is made wider
 LOST = 0.2  # mass that a chain of substeps may lose before it is divided
 MOST_SUBSTEPS = 128
+FAR = 1e100  # a state that has left every bounded set
 ROUNDING = 0.1  # share of the error of a cross interpolation that rounding after a convolution may add
 ALONE = 1e-9  # off-diagonal noise in a frame that needs no correction
 
@@ -60,13 +61,17 @@ class Prediction:
 
 @dataclass
 class Chain:
-    """The motion of a density over one interval, and the `moves` of the last prediction, in the order of time."""
+    """The motion of a density over one interval, and the `moves` of the last prediction, in the order of time.
+
+    `lost` is the largest share of the mass that a flow has carried out of every bounded set.
+    """
 
     prepared: Prepared
     interval: Interval
     values: Array
     builder: Builder
     moves: list[Move] = field(default_factory=list)
+    lost: float = 0.0
     _slope: Array = field(init=False)
 
     def _carried(self, u: Train, t0: float, t1: float) -> tuple[Carried, Mass]:
@@ -75,9 +80,11 @@ class Chain:
         points, weights = u.cloud(CLOUD)
         steps = motion.steps(self.interval, points, (t0, t1), self.values, 0.1 * self.builder.rule.tolerance)
         ends, logs = motion.ends(points, motion.path(self.interval, t0, t1, self.values, steps))
-        finite = np.isfinite(ends).all(axis=0) & np.isfinite(logs)
+        finite = (np.abs(ends) < FAR).all(axis=0) & np.isfinite(logs)  # NaN is not below, either
         if not finite.all():
-            points, ends, logs, weights = points[:, finite], ends[:, finite], logs[finite], weights[finite]
+            self.lost = max(self.lost, float(weights[~finite].sum()))
+            points, ends = (np.ascontiguousarray(part[:, finite]) for part in (points, ends))
+            logs, weights = logs[finite], weights[finite]
         if not weights.sum() > 0:
             raise Unresolved(f"no part of the density is finite after the drift from t = {t0:g} to {t1:g}")
         mass, top = Mass(ends, weights / weights.sum()), 0.0

@@ -22,7 +22,7 @@ from zakai.methods.frame.placement import Mass
 from zakai.methods.frame.state import Control, Prepared, State, Substeps, Unresolved
 from zakai.methods.frame.update import depth_of, update
 from zakai.methods.particles.programs import Array
-from zakai.methods.system.escape_of_states import check_escape
+from zakai.methods.system.escape_of_states import RARE, check_escape
 from zakai.models.prior import DensityPrior
 from zakai.numerics.trains.train import Train, quasi_random
 
@@ -153,11 +153,18 @@ def density(prepared: Prepared, state: State) -> TensorTrainDensity:
 
 def step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[State, Info]:
     """Return the state after interval k of the schedule and what is observed at its stop, and what the step reports."""
-    u = state.train(prepared.system.periods)
-    check_escape(prepared, k, lambda: u.moments())
+
+    def check(infinity: bool) -> None:
+        check_escape(prepared, k, lambda: state.train(prepared.system.periods).moments(), infinity)
+
+    check(infinity=False)
     try:
-        return _step(prepared, k, state, values)
+        after, lost = _step(prepared, k, state, values)
+        if lost > 0.5 * RARE:
+            check(infinity=True)
+        return after
     except (Unresolved, np.linalg.LinAlgError):
+        check(infinity=True)
         n = prepared.model.n
         health = dict.fromkeys(FIGURES, math.nan)
         # A density that is lost stays lost.
@@ -165,10 +172,12 @@ def step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[State
         return state, Info(math.nan, np.full(n, math.nan), np.full((n, n), math.nan), health)
 
 
-def _step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[State, Info]:
+def _step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[tuple[State, Info], float]:
+    """Return the step, and the share of the mass that the motion loses."""
     interval, control = prepared.interval(k), state.control
     builder = builder_of(prepared, state)
-    prediction, count, time = predicted(Chain(prepared, interval, values, builder), state)
+    chain = Chain(prepared, interval, values, builder)
+    prediction, count, time = predicted(chain, state)
     updated = update(builder, prediction, prepared.motion.likelihood(interval, values))
     v, rule = updated.density, builder.rule
     mean, cov = v.moments(direction_of(prepared, v))
@@ -195,7 +204,8 @@ def _step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[Stat
         "time_error": time.error,
         "effective_share": updated.effective,
     }
-    return State.of(v, Control(control.interval + 1, time, errors)), Info(updated.log_evidence, mean, cov, health)
+    lost = max(chain.lost, prediction.defect)
+    return (State.of(v, Control(control.interval + 1, time, errors)), Info(updated.log_evidence, mean, cov, health)), lost
 
 
 def error_of(prepared: Prepared, state: State) -> float:
