@@ -23,6 +23,9 @@ SHARE, CORES = 0.5, 0.25
 LEAST = 0.6  # of the tolerance that earlier errors may leave
 EDGE = 0.3  # share of the tolerance that may be near an end of an axis
 ROUGH = 4.0  # tolerances of error off the grid, above which the grid is made finer
+# A build whose rank meets its limit keeps an error, which the next one would have to resolve: at the same tolerance errors grow.
+HELD = 2.0  # tolerances of error on the grid that such a build may have, or the tolerance of the next ones is doubled
+LOOSEST = 0.1
 WIDER = 0.25  # share of a box that is added at both ends of an axis with mass there
 
 
@@ -43,11 +46,13 @@ class Builder:
     """Builds densities for one step, and keeps the reports of all builds.
 
     The errors of the builds of an interval add up: each has a `share` of its tolerance.  So do those of intervals where the data
-    leaves them: the `error` of the mean at the start, in deviations, lowers the tolerance.
+    leaves them: the `error` of the mean at the start, in deviations, lowers the tolerance.  It is `looser` by a factor where ranks
+    met their limit.
     """
 
     prepared: Prepared
     error: float = 0.0
+    looser: float = 1.0
     reports: list[Report] = field(default_factory=list)
     share: float = 1.0
 
@@ -56,9 +61,18 @@ class Builder:
         self.share = 2.0 / (count + 1)
 
     @property
+    def allowed(self) -> float:
+        """The error of the mean that the ranks can hold: the tolerance, or more."""
+        return min(self.looser * self.prepared.tolerance, max(LOOSEST, self.prepared.tolerance))
+
+    def after(self) -> float:
+        """Return `looser` for the next interval."""
+        return self.looser if any(report.capped for report in self.reports) else max(1.0, 0.5 * self.looser)
+
+    @property
     def _tolerance(self) -> float:
         """The error of a build."""
-        tolerance = self.prepared.tolerance
+        tolerance = self.allowed
         return SHARE * self.share * tolerance * min(1.0, max(tolerance / max(self.error, 1e-300), LEAST))
 
     @property
@@ -106,6 +120,8 @@ class Builder:
             found, report = self._crossed(Placed(grid, D), function, control, options)
         if loose == 1.0:
             self.reports.append(report)
+            if report.capped and report.on_grid > HELD * rule.tolerance and self.allowed < LOOSEST:
+                self.looser *= 2.0
         return found, D
 
     def _crossed(

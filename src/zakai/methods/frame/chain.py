@@ -185,8 +185,8 @@ class Chain:
                 if count >= MOST_SUBSTEPS:
                     raise
             else:
-                if found.defect < LOST or count >= MOST_SUBSTEPS:
-                    return found, count
+                if found.defect < LOST or count >= MOST_SUBSTEPS or self.builder.reports[-1].on_grid > LOST:
+                    return found, count  # what a cross interpolation misses is not a matter of substeps
             count *= 2
 
 

@@ -205,7 +205,7 @@ def _step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[tupl
         "effective_share": updated.effective,
     }
     lost = max(chain.lost, prediction.defect)
-    return (State.of(v, Control(control.interval + 1, time, errors)), Info(updated.log_evidence, mean, cov, health)), lost
+    return (State.of(v, Control(control.interval + 1, time, errors, builder.after())), Info(updated.log_evidence, mean, cov, health)), lost
 
 
 def error_of(prepared: Prepared, state: State) -> float:
@@ -215,7 +215,7 @@ def error_of(prepared: Prepared, state: State) -> float:
 
 def builder_of(prepared: Prepared, state: State) -> Builder:
     """Return what builds the densities of the interval that follows on a state."""
-    return Builder(prepared, error_of(prepared, state))
+    return Builder(prepared, error_of(prepared, state), state.control.looser)
 
 
 def predicted(chain: Chain, state: State) -> tuple[Prediction, int, Substeps]:
@@ -251,7 +251,7 @@ def _in_deviations(error: Array, cov: Array) -> float:
 
 def _audited(chain: Chain, u: Train, coarser: Prediction, count: int, number: int) -> tuple[Prediction, int, Substeps]:
     """Return the prediction extrapolated from s and 2 s substeps, 2 s, and what their difference says of the next intervals."""
-    allowed, length = TIME_SHARE * chain.prepared.tolerance, chain.interval.stop - chain.interval.start
+    allowed, length = TIME_SHARE * chain.builder.allowed, chain.interval.stop - chain.interval.start
     while True:
         finer, more = chain.first(u, 2 * count)
         control = finer.mass.control(CONTROLS, chain.prepared.tolerance)

@@ -36,12 +36,14 @@ class Substeps(NamedTuple):
 class Control(NamedTuple):
     """What decides the next step beside the density.
 
-    The number of intervals, the substeps, and the estimated error of the mean, as a covariance (n, n).
+    The number of intervals, the substeps, the estimated error of the mean, as a covariance (n, n), and the factor of the tolerance
+    where ranks met their limit.
     """
 
     interval: int
     time: Substeps
     error: Array
+    looser: float = 1.0
 
 
 class State(NamedTuple):
