@@ -92,6 +92,7 @@ AUTO = (
     "limited-direct",
     "general-direct",
     "yau-yau",
+    "tensor-train",
     "guided-particles",
 )
 

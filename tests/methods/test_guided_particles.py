@@ -210,7 +210,8 @@ def test_auto_takes_particles_where_four_states_are_seen_nonlinearly_and_as_the_
     assert in_order(nonlinear).index(PARTICLES) < in_order(nonlinear).index("general-direct")
     result = zakai.filter(nonlinear, zakai.Record([0.1], [[0.3]], "samples"))
     assert result.method == PARTICLES and "least time" in result.why
-    assert in_order(zakai.Model(**keys, observation=["x"], prior=prior))[-3:] == (PARTICLES, "limited-direct", "yau-yau")
+    order = in_order(zakai.Model(**keys, observation=["x"], prior=prior))
+    assert order.index(PARTICLES) < order.index("limited-direct") < order.index("yau-yau")
     plane = zakai.Model(state=["x", "v"], drift=["v", "-sin(x)"], observation=["x"], observation_kind="samples")
     assert in_order(plane)[-1] == PARTICLES
 

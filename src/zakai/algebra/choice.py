@@ -11,7 +11,7 @@ from zakai.algebra.advice import nearest, what_to_do
 from zakai.algebra.conditions import Condition, all_hold
 from zakai.algebra.expected_work import expected_work
 from zakai.algebra.independent import IndependentBlock, independent_blocks
-from zakai.algebra.order import AFFORDABLE, GENERAL, in_order, work_in_words
+from zakai.algebra.order import AFFORDABLE, GENERAL, by_work, in_order, work_in_words
 from zakai.algebra.theorems import conditions_of
 from zakai.errors import ConditionError
 from zakai.models.model import Model
@@ -82,12 +82,14 @@ def _reason(name: str, model: Model, tolerance: float | None) -> str:
     if name not in GENERAL or model.n == 1:
         return "the first method whose every assumption holds for this system"
     reason = "particles, which hold for any model: no other method that auto tries holds for this system"
-    if all_hold(conditions_of("yau-yau", model)) is True:
+    held = [other for other in by_work(model, tolerance) if all_hold(conditions_of(other, model)) is True]
+    if len(held) > 1:
         reason = (
             "no exact method holds, and this one is expected to need the least time for its accuracy, or at most "
-            f"{AFFORDABLE:g} times that and to be more exact (for an observation {work_in_words(model, tolerance)})"
+            f"{AFFORDABLE:g} times that and to be more exact (for an observation {work_in_words(model, tolerance, held)})"
         )
-    if (model.n < 3 and name == "yau-yau") or all_hold(conditions_of("tensor-train", model)) is not True:
+    exact = name == "tensor-train" or (model.n < 3 and name == "yau-yau")
+    if exact or all_hold(conditions_of("tensor-train", model)) is not True:
         return reason
     how = "more exactly, and may take much longer" if name == "guided-particles" else "often in less time"
     return f"{reason}; tensor-train by name gives the whole density, {how}"

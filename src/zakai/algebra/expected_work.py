@@ -26,7 +26,17 @@ MOST_POINTS = 2**18
 WIDE = 4.0  # curvature of a level of h, in deviations of its noise, that adds the points of one more grid
 PARTICLES = 5.0  # particles, times the square of the tolerance
 TOLERANCE = 0.03  # of particles, where none is asked for
-DRAWS = 64  # points of the prior at which the sensors are differentiated
+DRAWS = 64  # points of the prior at which the sensors and the drift are differentiated
+# Seconds of one product of an evaluation of a train, and of all else in an observation; builds of an observation, points along an
+# axis, and builds for one column of a noise that depends on the state.  The product is three times as long as is measured, as a
+# rank that is 1.4 times the expected one makes it.
+PRODUCT, AROUND = 3.6e-8, 0.01
+BUILDS, TRAIN_AXIS, KICK = 2.5, 30, 20
+MOST_STATES, MOST_RANK = 6, 24
+# Rank of a train: of a system near a linear one, per relative variation of the drift's derivatives over the prior, per square of
+# the curvature of a sensor; and the growth with the inverse of the tolerance.  Eighteen systems with ranks from 3 to 24.
+RANK, OF_DRIFT, OF_SENSORS, OF_TOLERANCE = 3.0, 40.0, 15.0, 0.25
+TRAIN_TOLERANCES = 1e-3, 5e-3  # for three states and for more, where none is asked for
 STEP = 1e-3  # of these differences, in deviations of the prior
 
 
@@ -48,6 +58,8 @@ def expected_work(name: str, model: Model, tolerance: float | None) -> Work | No
         return None
     if name == "yau-yau":
         return _of_grid(model)
+    if name == "tensor-train":
+        return _of_train(model, tolerance)
     if name == "guided-particles":
         count = PARTICLES / (TOLERANCE if tolerance is None else tolerance) ** 2
         return Work(PARTICLE * count, f"{_display.rough(count)} particles")
@@ -66,6 +78,60 @@ def _of_grid(model: Model) -> Work:
     return Work(POINT * min(points, MOST_POINTS), f"a grid of {_display.rough(points)} points", fails)
 
 
+def _of_train(model: Model, tolerance: float | None) -> Work | None:
+    """Return the work of a tensor train; None where its rank cannot be told from the model and the prior.
+
+    A build takes about n - 2 cores of r^2 N fibres and two of r N, each an evaluation of n r products.
+    """
+    n = model.n
+    laws = (features.OF_OBSERVATION - {features.OBSERVED_ANGLES}) & model.features.keys()
+    prior = model.prior
+    if not isinstance(prior, GaussianPrior) or model.observation_kind != "samples" or laws or not 3 <= n <= MOST_STATES:
+        return None
+    usual = TRAIN_TOLERANCES[n > 3]
+    tolerance = usual if tolerance is None else tolerance
+    if not 1e-6 <= tolerance <= 0.1:
+        return None
+    rank = RANK + OF_DRIFT * variation(model) + OF_SENSORS * curvature(model) ** 2
+    rank *= (usual / tolerance) ** OF_TOLERANCE
+    used = min(rank, MOST_RANK)
+    builds = BUILDS * (KICK * model.diffusion.shape[1] if model.diffusion.free_symbols & set(model.x) else 1)
+    evaluations = TRAIN_AXIS * ((n - 2) * used**2 + 2 * used)
+    words = f"a tensor train of rank {_display.rough(rank)}"
+    return Work(AROUND + PRODUCT * builds * evaluations * n * used, words, not rank <= MOST_RANK)
+
+
+@once_for_a_model
+def variation(model: Model) -> float:
+    """Return how much the derivatives of the drift vary over the prior, relative to their size; in its deviations.
+
+        median |A - median A| / median |A|,      A = R^-1 (df/dx) R,  the prior has the covariance R R'
+    """
+    assert isinstance(model.prior, GaussianPrior)
+    _, root, draws = _draws(model.prior)
+    f, at, theta = numpy_function(model.drift, model), float(model.start), model.theta()
+    inputs = np.ones(len(model.u)) if model.u else None  # with zeros a speed times a direction would be linear
+    sides = draws[:, None, None] + STEP * np.array([1.0, -1.0])[:, None, None] * root.T
+    values = f(sides, at, theta, inputs)
+    J = np.moveaxis((values[:, 0] - values[:, 1]) / (2.0 * STEP), 1, 2)
+    scale = np.maximum(np.sqrt(np.diag(root @ root.T)), 1e-300)
+    A = np.linalg.lstsq(root / scale[:, None], np.moveaxis(J / scale[:, None], 0, 1).reshape(model.n, -1), rcond=1e-9)[0]
+    A = np.moveaxis(A.reshape(model.n, len(draws), model.n), 1, 0)
+    A = A[np.isfinite(A).all(axis=(1, 2))]
+    if not len(A):
+        return np.inf
+    sizes, apart = np.linalg.norm(A, axis=(1, 2)), np.linalg.norm(A - np.median(A, axis=0), axis=(1, 2))
+    return float(np.median(apart) / max(float(np.median(sizes)), 1e-300))
+
+
+def _draws(prior: GaussianPrior | MixturePrior) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the mean of a prior, a root of its covariance, and draws of the Gaussian with both."""
+    mean, cov = np.asarray(prior.mean, float), np.asarray(prior.cov, float)
+    values, vectors = np.linalg.eigh(cov)
+    root = vectors * np.sqrt(np.maximum(values, 0.0))
+    return mean, root, mean + np.random.default_rng(1).standard_normal((DRAWS, len(mean))) @ root.T
+
+
 @once_for_a_model
 def curvature(model: Model) -> float:
     """Return how curved the levels of h are over the prior, in deviations of the noise: the largest of all sensors.
@@ -77,10 +143,7 @@ def curvature(model: Model) -> float:
     prior, laws = model.prior, (features.OF_OBSERVATION - {features.OBSERVED_ANGLES}) & model.features.keys()
     if model.observation_kind != "samples" or laws or not isinstance(prior, GaussianPrior | MixturePrior):
         return 0.0
-    mean, cov = np.asarray(prior.mean, float), np.asarray(prior.cov, float)
-    values, vectors = np.linalg.eigh(cov)
-    root = vectors * np.sqrt(np.maximum(values, 0.0))
-    draws = mean + np.random.default_rng(1).standard_normal((DRAWS, model.n)) @ root.T
+    mean, root, draws = _draws(prior)
     at, theta, inputs = float(model.start), model.theta(), np.zeros(len(model.u)) if model.u else None
     h = numpy_function(model.observation, model, (model.m,))
     sides = draws[:, None, None] + STEP * np.array([1.0, -1.0])[:, None, None] * root.T

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import sympy as sp
 
 from zakai import _registry
@@ -12,7 +14,7 @@ from zakai.models.model import Model
 
 # Methods for any system of several states, the most exact first.  To let "auto" take another one, name it here and give its work
 # in `expected_work`.
-GENERAL = ("yau-yau", "guided-particles")
+GENERAL = ("yau-yau", "tensor-train", "guided-particles")
 AFFORDABLE = 3.0  # times the work of the cheapest method, up to which a more exact one is taken
 
 
@@ -39,7 +41,7 @@ def in_order(model: Model, tolerance: float | None = None) -> tuple[str, ...]:
     first, *others = by_work(model, tolerance) if model.n > 1 else ("yau-yau", "guided-particles")
     # It takes the nearest image of an angle alone.
     last = (first, *later, *others, *(["kalman-bucy"] if features.OBSERVED_ANGLES in model.features else []))
-    return (*(name for name in _registry.AUTO if name not in last), *last)
+    return (*(name for name in _registry.AUTO if name not in last and name not in GENERAL), *last)
 
 
 def _read(model: Model) -> set[sp.Symbol]:
@@ -63,11 +65,11 @@ def by_work(model: Model, tolerance: float | None = None) -> tuple[str, ...]:
     return (first, *others)
 
 
-def work_in_words(model: Model, tolerance: float | None = None) -> str:
-    """Return the expected work of the methods for any system, as in "yau-yau 0.3 s (a grid of 33,000 points), ..."."""
+def work_in_words(model: Model, tolerance: float | None, names: Sequence[str]) -> str:
+    """Return the expected work of methods for any system, as in "yau-yau 0.3 s (a grid of 33,000 points), ..."."""
 
     def words(name: str, work: Work | None) -> str:
         fails = ", which would not hold the density" if work is not None and work.fails else ""
         return f"{name} {work}{fails}"
 
-    return ", ".join(words(name, expected_work(name, model, tolerance)) for name in by_work(model, tolerance))
+    return ", ".join(words(name, expected_work(name, model, tolerance)) for name in names)

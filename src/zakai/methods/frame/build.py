@@ -46,8 +46,8 @@ class Builder:
     """Builds densities for one step, and keeps the reports of all builds.
 
     The errors of the builds of an interval add up: each has a `share` of its tolerance.  So do those of intervals where the data
-    leaves them: the `error` of the mean at the start, in deviations, lowers the tolerance.  It is `looser` by a factor where ranks
-    met their limit.
+    leaves them: the `error` of the mean at the start, in deviations, lowers the tolerance.  It is `looser` by a factor where
+    ranks met their limit.
     """
 
     prepared: Prepared

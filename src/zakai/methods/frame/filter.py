@@ -181,7 +181,7 @@ def _step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[tupl
     updated = update(builder, prediction, prepared.motion.likelihood(interval, values))
     v, rule = updated.density, builder.rule
     mean, cov = v.moments(direction_of(prepared, v))
-    depth = depth_of(updated.prediction, prediction.mass, v)
+    depth = depth_of(updated.prediction, prediction.mass, v, rule.tolerance)
     reports = builder.reports
     off_grid, edge = sum(report.off_grid for report in reports), max(report.edge for report in reports)
     # Far out a density is known relative to its largest value only; beyond, a Gaussian stands for it.
@@ -205,7 +205,8 @@ def _step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[tupl
         "effective_share": updated.effective,
     }
     lost = max(chain.lost, prediction.defect)
-    return (State.of(v, Control(control.interval + 1, time, errors, builder.after())), Info(updated.log_evidence, mean, cov, health)), lost
+    after = Control(control.interval + 1, time, errors, builder.after())
+    return (State.of(v, after), Info(updated.log_evidence, mean, cov, health)), lost
 
 
 def error_of(prepared: Prepared, state: State) -> float:

@@ -36,8 +36,8 @@ class Substeps(NamedTuple):
 class Control(NamedTuple):
     """What decides the next step beside the density.
 
-    The number of intervals, the substeps, the estimated error of the mean, as a covariance (n, n), and the factor of the tolerance
-    where ranks met their limit.
+    The number of intervals, the substeps, the estimated error of the mean, as a covariance (n, n), and the factor of the
+    tolerance where ranks met their limit.
     """
 
     interval: int

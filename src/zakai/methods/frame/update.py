@@ -112,9 +112,10 @@ def _power(mass: Mass, logs: Array) -> float:
     return float(10.0**low)
 
 
-def depth_of(u: Carried, mass: Mass, posterior: Train) -> float:
-    """Return log(max u / u where the posterior is) of a prediction u of which points are known: zero for two equal Gaussians."""
+def depth_of(u: Carried, mass: Mass, posterior: Train, tolerance: float) -> float:
+    """Return log(max u / u) where the posterior is, of a prediction known to a share of max u; zero for equal Gaussians."""
     points, weights = posterior.cloud(DEPTH_POINTS)
-    values = np.maximum(u(np.concatenate([points, mass.points], axis=1)), 1e-300)
+    values = u(np.concatenate([points, mass.points], axis=1))
+    values = np.where(values > 0, values, tolerance * values.max())  # no more is known of it where it is not positive
     count, n = len(weights), len(points)
     return float(math.log(values[count:].max()) - weights @ np.log(values[:count]) - 0.5 * n)
