@@ -6,6 +6,7 @@ import numpy as np
 
 import zakai
 from methods.tracks import NAMES, track
+from zakai.methods.frame.tensor_train import METHOD
 
 
 def test_a_linear_track_agrees_with_the_kalman_filter_through_gaps_and_missing_coordinates():
@@ -161,6 +162,25 @@ def test_a_fit_finds_the_maximum_by_values():
     assert by_values.converged
     assert abs(by_values.estimates["a"] - by_gradient.estimates["a"]) < 0.05 * by_gradient.standard_errors["a"]
     assert "its maximum is known to a +- " in by_values.message and not by_values.warnings
+
+
+def test_differences_of_the_evidence_are_right_where_runs_have_their_choices_in_common():
+    model = zakai.Model(
+        state=["x", "v"], drift=["v", "-a*sin(x)"], diffusion=[[0], [0.3]], observation=["x"], observation_kind="samples",
+        observation_noise=[[0.04]], parameters={"a": 1.0}, prior={"kind": "gaussian", "mean": [0, 1], "cov": [0.1, 0.1]},
+    )  # fmt: skip
+    _, record = zakai.simulate(model, np.arange(1, 7) * 0.5, seed=1)
+    choices = METHOD.by_values()
+
+    def log_likelihood(a, method="tensor-train", **options):
+        return zakai.filter(model.with_parameters(a=a), record, method, keep="moments", **options).log_likelihood
+
+    first, exact = log_likelihood(1.0, tolerance=5e-3, choices=choices), log_likelihood(1.0, "yau-yau")
+    again = log_likelihood(1.0, tolerance=5e-3, choices=choices)
+    assert abs(first - exact) < 5e-3 and abs(again - exact) < 5e-3
+    for apart in (-0.02, -0.001, 0.001, 0.005):
+        found = log_likelihood(1.0 + apart, tolerance=5e-3, choices=choices) - again
+        assert abs(found - (log_likelihood(1.0 + apart, "yau-yau") - exact)) < 3e-4
 
 
 def test_a_density_is_saved_to_the_bit_and_is_the_prior_of_a_later_record(tmp_path):

@@ -27,6 +27,7 @@ WIDE = 4.0  # curvature of a level of h, in deviations of its noise, that adds t
 PARTICLES = 5.0  # particles, times the square of the tolerance
 TOLERANCE = 0.03  # of particles, where none is asked for
 DRAWS = 64  # points of the prior at which the sensors and the drift are differentiated
+STEP = 1e-3  # of these differences, in deviations of the prior
 # Seconds of one product of an evaluation of a train, and of all else in an observation; builds of an observation, points along an
 # axis, and builds for one column of a noise that depends on the state.  The product is three times as long as is measured, as a
 # rank that is 1.4 times the expected one makes it.
@@ -37,7 +38,6 @@ MOST_STATES, MOST_RANK = 6, 24
 # the curvature of a sensor; and the growth with the inverse of the tolerance.  Eighteen systems with ranks from 3 to 24.
 RANK, OF_DRIFT, OF_SENSORS, OF_TOLERANCE = 3.0, 40.0, 15.0, 0.25
 TRAIN_TOLERANCES = 1e-3, 5e-3  # for three states and for more, where none is asked for
-STEP = 1e-3  # of these differences, in deviations of the prior
 
 
 class Work(NamedTuple):
@@ -79,7 +79,7 @@ def _of_grid(model: Model) -> Work:
 
 
 def _of_train(model: Model, tolerance: float | None) -> Work | None:
-    """Return the work of a tensor train; None where its rank cannot be told from the model and the prior.
+    """Return the work of a tensor train; None where the model and the prior do not give its rank.
 
     A build takes about n - 2 cores of r^2 N fibres and two of r N, each an evaluation of n r products.
     """

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -177,7 +177,9 @@ def fit(
         method = plan.method  # the choice of "auto" may depend on the parameters
     if any(one.random or one.by_values for one in methods):
         random = any(one.random for one in methods)
-        return _fit_by_values(now, record, names, values, box, method, options if random else {**options, "seed": None})
+        maker = next((one.by_values for one in methods if one.by_values is not None), None)
+        given = options if random else {**options, "seed": None}
+        return _fit_by_values(now, record, (names, values, box), method, given, maker)
     function, known = LogLikelihood(now, record, method, names, options), dict[bytes, tuple[float, np.ndarray]]()
     what = f"{model.source}: fit: the search for the largest log-likelihood by {listing(names)}"
     with bar("fitting: log-likelihood and gradient") as advance, announced(what):
@@ -222,32 +224,44 @@ def fit(
 def _fit_by_values(
     model: Model,
     record: Record,
-    names: tuple[str, ...],
-    values: np.ndarray,
-    box: np.ndarray,
+    where: tuple[tuple[str, ...], np.ndarray, np.ndarray],
     method: str,
     options: dict[str, Any],
+    maker: Callable[[], Any] | None,
 ) -> Fit:
-    """Return the fit by values of a log-likelihood, with common random numbers; a seed of None is for one without."""
+    """Return the fit by values of a log-likelihood, with common random numbers or choices.
+
+    Args:
+        model: the system.
+        record: the observations.
+        where: the names of the parameters, their values at the start, and their bounds.
+        method: the name of the method.
+        options: its options; a seed of None is for a method without.
+        maker: what makes the choices, None for a method without.
+    """
+    names, values, box = where
     known: dict[tuple[bytes, int], float] = {}
-    options = dict(options)
+    options, choices = dict(options), dict[int, Any]()
     first = options.pop("seed", 0)
 
-    def result_at(theta: np.ndarray, seed: int) -> Any:
+    def result_at(theta: np.ndarray, seed: int, common: Any = None) -> Any:
         at = model.with_parameters(**dict(zip(names, theta.tolist(), strict=True)))
         own = options if first is None else {**options, "seed": int(first) + seed}
+        own = own if common is None else {**own, "choices": common}
         return run_filter(at, record, method, keep="moments", **own)
 
     what = f"{model.source}: fit: the search for the largest log-likelihood by {listing(names)}"
     with bar("fitting: log-likelihood") as advance, announced(what):
 
         def value(theta: np.ndarray, seed: int) -> float:
-            key = theta.tobytes(), 0 if first is None else seed
+            key = theta.tobytes(), seed
             if key not in known:
                 if advance is not None:
                     advance(len(known) + 1, None)
+                if maker is not None and seed not in choices:
+                    choices[seed] = maker()
                 try:
-                    known[key] = result_at(theta, seed).log_likelihood
+                    known[key] = result_at(theta, seed, choices.get(seed)).log_likelihood
                 except InputError:
                     known[key] = -np.inf
             return known[key]

@@ -41,7 +41,7 @@ def random_maximum(function: Callable[[Array, int], float], start: Array, box: A
     """Return the maximum of a function of p parameters and a seed, within bounds (p, 2).
 
     Args:
-        function: the function.
+        function: the function of the parameters and the seed; without seeds, of what the values of one quadratic have in common.
         start: the parameters from which the search begins (p,).
         box: the bounds.
         seeds: whether the values depend on the seed; else centres are shifted instead.
@@ -51,7 +51,11 @@ def random_maximum(function: Callable[[Array, int], float], start: Array, box: A
     converged, rounds, distance = False, 0, DISTANCE if seeds else NEAR
     while rounds < ROUNDS and not converged:
         rounds += 1
-        slope, H = _quadratic(lambda theta: 0.5 * (function(theta, 0) + function(theta, 1)), centre, apart, box)
+        one, two = (0, 1) if seeds else (-rounds, -rounds)
+        slope, H = _quadratic(
+            lambda theta, one=one, two=two: 0.5 * (function(theta, one) + function(theta, two)),  # type: ignore[misc]
+            centre, apart, box,
+        )  # fmt: skip
         step = _step(slope, H, apart)
         moved = np.clip(centre + step, box[:, 0], box[:, 1]) - centre
         centre = centre + moved

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from zakai.methods.frame.placement import Mass, Placed, Rule, closed_axes, place, with_spacing
-from zakai.methods.frame.state import Prepared, Unresolved
+from zakai.methods.frame.state import Choice, Prepared, Unresolved
 from zakai.methods.particles.programs import Array
 from zakai.numerics.trains.carried import Carried
 from zakai.numerics.trains.cross import FLOOR, Options, cross
@@ -54,6 +54,7 @@ class Builder:
     error: float = 0.0
     looser: float = 1.0
     reports: list[Report] = field(default_factory=list)
+    made: list[tuple[Train, Choice]] = field(default_factory=list)
     share: float = 1.0
 
     def for_substeps(self, count: int) -> None:
@@ -105,7 +106,7 @@ class Builder:
             rule, options = rule._replace(tolerance=loose * rule.tolerance), options._replace(tolerance=loose * options.tolerance)
         mass = mass.unwrapped(angles)
         if angles.any() and isinstance(function, Carried):
-            function = function.about(np.where(angles, mass.points @ mass.weights, np.nan))
+            function = function.about(self._turn(mass))
         closed = closed_axes(mass, angles, rule)
         grid, D = place(function, mass, closed, rule, noise, stretch)
         if not (np.isfinite(grid.step).all() and np.isfinite(grid.basis).all() and np.isfinite(grid.low).all()):
@@ -118,11 +119,22 @@ class Builder:
             span = np.where(out, WIDER * (grid.high - grid.low), 0.0)
             grid = with_spacing(grid, grid.low - span, grid.high + span, 0.7 * grid.step if rough else grid.step, rule)
             found, report = self._crossed(Placed(grid, D), function, control, options)
+        if self.prepared.choices is not None:
+            counted = control.points, control.moving
+            self.made.append((found, Choice(found.grid, counted, options, report.rank, self._turn(mass))))
         if loose == 1.0:
             self.reports.append(report)
             if report.capped and report.on_grid > HELD * rule.tolerance and self.allowed < LOOSEST:
                 self.looser *= 2.0
         return found, D
+
+    def _turn(self, mass: Mass) -> Array:
+        """Return about which turn the angles of a density are (n,), NaN for other states."""
+        return np.where(self.prepared.system.base.angles, mass.points @ mass.weights, np.nan)
+
+    def choice(self, v: Train) -> Choice | None:
+        """Return how a density was built, where choices are kept."""
+        return next((choice for train, choice in reversed(self.made) if train is v), None)
 
     def _crossed(
         self, placed: Placed, function: Callable[[Array], Array], control: Mass, options: Options

@@ -24,7 +24,7 @@ import numpy as np
 from zakai.methods.frame.build import CLOUD, Builder
 from zakai.methods.frame.moves import Flow, Kick, Move, Noise
 from zakai.methods.frame.placement import Mass
-from zakai.methods.frame.state import Prepared, Unresolved
+from zakai.methods.frame.state import Half, Prepared, Unresolved
 from zakai.methods.frame.weak_points import WeakPoints
 from zakai.methods.particles.interval import Interval
 from zakai.methods.particles.programs import Array
@@ -52,6 +52,7 @@ class Prediction:
     log_mass: float
     defect: float
     slope: Array
+    motions: tuple[tuple[Half, ...], ...] = ()
 
     @property
     def log_scale(self) -> float:
@@ -63,7 +64,7 @@ class Prediction:
 class Chain:
     """The motion of a density over one interval, and the `moves` of the last prediction, in the order of time.
 
-    `lost` is the largest share of the mass that a flow has carried out of every bounded set.
+    Lost is the largest share of the mass that a flow has carried out of every bounded set.
     """
 
     prepared: Prepared
@@ -72,6 +73,7 @@ class Chain:
     builder: Builder
     moves: list[Move] = field(default_factory=list)
     lost: float = 0.0
+    halves: list[Half] = field(default_factory=list)
     _slope: Array = field(init=False)
 
     def _carried(self, u: Train, t0: float, t1: float) -> tuple[Carried, Mass]:
@@ -94,12 +96,18 @@ class Chain:
         if prepared.system.weighted:
             top = float(logs.max())
             mass = mass.reweighted(logs)
+        function = self.carried(u, (t0, t1), steps, top)
+        self.moves.append(Flow(motion, function.terms[0].path))
+        self.halves.append(Half(steps, top))
+        return function, mass
+
+    def carried(self, u: Train, span: tuple[float, float], steps: int, top: float) -> Carried:
+        """Return a density after the flow over a span as a function, divided by the exponential of `top`."""
+        motion, (t0, t1) = self.prepared.motion, span
         back = motion.path(self.interval, t1, t0, self.values, steps)
-        self.moves.append(Flow(motion, back))
         term = Term(u, np.array([1.0, top]), motion.backward, back)
         nothing = Likelihood(motion.coefficients.law, np.zeros(0), np.zeros(0), t1, 1.0, 0.0)
-        turn = np.full(len(points), np.nan)
-        return Carried((term,), motion.box, turn, nothing), mass
+        return Carried((term,), motion.box, np.full(u.grid.n, np.nan), nothing)
 
     def _middle(self, u: Train, t0: float, t1: float, length: float) -> tuple[Train, float, float]:
         """Return the density after the flow from t0 to t1 and the noise about t1, the logarithm of its mass, and the defect."""
@@ -112,6 +120,7 @@ class Chain:
         scale = np.maximum(np.sqrt(np.diag(P)), 1e-12)
         Q = prepared.motion.noise(self.interval, self.values, t1, length, (mean, scale))
         v, D, total = self._built(function, mass, Q)
+        self.halves[-1] = self.halves[-1]._replace(about=(mean, scale), choice=self.builder.choice(v))
         variances, turned = np.maximum(np.diag(D), 0.0), corrections(D)
         self.moves.append(Noise(v, variances, turned))
         v = v.convolve(variances, ROUNDING * self.builder.options.tolerance)
@@ -163,10 +172,10 @@ class Chain:
     def predict(self, u: Train, count: int) -> Prediction:
         """Return the prediction by so many substeps; Unresolved where the density is lost."""
         start, stop = self.interval.start, self.interval.stop
-        self.moves = []
+        self.moves, self.halves = [], []
         self._slope = np.eye(self.prepared.model.n)
         if stop <= start:
-            return Prediction(*self._carried(u, start, stop), 0.0, 0.0, self._slope)
+            return Prediction(*self._carried(u, start, stop), 0.0, 0.0, self._slope, (tuple(self.halves),))
         self.builder.for_substeps(count)
         length, at, log_mass, defect = (stop - start) / count, start, 0.0, 0.0
         for j in range(count):
@@ -174,7 +183,7 @@ class Chain:
             u, gained, lost = self._middle(u, at, middle, length)
             log_mass, defect, at = log_mass + gained, defect + lost, middle
         function, mass = self._carried(u, at, stop)
-        return Prediction(function, mass, log_mass, defect, self._slope)
+        return Prediction(function, mass, log_mass, defect, self._slope, (tuple(self.halves),))
 
     def first(self, u: Train, count: int) -> tuple[Prediction, int]:
         """Return the prediction by the fewest substeps, `count` or more, that keep the mass, and their number."""

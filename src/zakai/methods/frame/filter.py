@@ -16,10 +16,11 @@ import numpy as np
 from zakai.densities import TensorTrainDensity
 from zakai.densities._values import wrap
 from zakai.methods._protocol import Info
+from zakai.methods.frame import again
 from zakai.methods.frame.build import CONTROLS, Builder, difference
 from zakai.methods.frame.chain import MOST_SUBSTEPS, Chain, Prediction, extrapolated
 from zakai.methods.frame.placement import Mass
-from zakai.methods.frame.state import Control, Prepared, State, Substeps, Unresolved
+from zakai.methods.frame.state import Choice, Control, Made, Prepared, State, Substeps, Unresolved
 from zakai.methods.frame.update import depth_of, update
 from zakai.methods.particles.programs import Array
 from zakai.methods.system.escape_of_states import RARE, check_escape
@@ -54,7 +55,13 @@ def init(prepared: Prepared, prior: Any) -> State:
         inside = ((x >= system.lower[:, None]) & (x <= system.upper[:, None])).all(axis=0)
         return np.where(inside & np.isfinite(values), values, 0.0)
 
+    choices, key = prepared.choices, (tuple(model.state), -1)
+    known = None if choices is None else choices.made.get(key)
+    if isinstance(known, Choice):
+        return again.begun(prepared, function, known)
     v, _ = builder.build(function, mass)
+    if choices is not None and (made := builder.choice(v)) is not None:
+        choices.made[key] = made
     assert model.n == len(mass.points) and len(theta) == len(prepared.theta)
     report = builder.reports[-1]
     _, P = mass.unwrapped(system.base.angles).moments()
@@ -175,11 +182,18 @@ def step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[State
 def _step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[tuple[State, Info], float]:
     """Return the step, and the share of the mass that the motion loses."""
     interval, control = prepared.interval(k), state.control
+    choices, key = prepared.choices, (tuple(prepared.model.state), control.interval)
+    known = None if choices is None else choices.made.get(key)
+    if isinstance(known, Made):
+        return again.step(Chain(prepared, interval, values, Builder(prepared)), state, known, FIGURES), 0.0
     builder = builder_of(prepared, state)
     chain = Chain(prepared, interval, values, builder)
     prediction, count, time = predicted(chain, state)
     updated = update(builder, prediction, prepared.motion.likelihood(interval, values))
     v, rule = updated.density, builder.rule
+    if choices is not None and updated.choice is not None:
+        tails = updated.prediction.terms[0].density.tails
+        choices.made[key] = Made(prediction.motions, tails, updated.top, updated.choice)
     mean, cov = v.moments(direction_of(prepared, v))
     depth = depth_of(updated.prediction, prediction.mass, v, rule.tolerance)
     reports = builder.reports
@@ -268,4 +282,5 @@ def _audited(chain: Chain, u: Train, coarser: Prediction, count: int, number: in
     extrapolate = plain > 3.0 * both
     found = Substeps((both if extrapolate else plain) / length, number, extrapolate, error / GAIN)
     extra = extrapolated(finer, coarser)
-    return Prediction(extra, finer.mass, finer.log_mass, finer.defect, finer.slope), more, found
+    motions = (*finer.motions, *coarser.motions)
+    return Prediction(extra, finer.mass, finer.log_mass, finer.defect, finer.slope, motions), more, found

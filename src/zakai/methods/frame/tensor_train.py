@@ -5,12 +5,13 @@ from __future__ import annotations
 import numpy as np
 
 from zakai.algebra.theorems import tensor_train as theorem
+from zakai.errors import InputError
 from zakai.methods._options import real_number, whole_number
 from zakai.methods._protocol import Method
 from zakai.methods.frame.backward import BACKWARD
 from zakai.methods.frame.filter import density, init, step
 from zakai.methods.frame.motion import system_of
-from zakai.methods.frame.state import Prepared, State
+from zakai.methods.frame.state import Choices, Prepared, State
 from zakai.methods.frame.validity import valid
 from zakai.models import features
 from zakai.models.model import Model
@@ -22,7 +23,8 @@ MOST_RANK = 24
 
 
 def prepare(
-    model: Model, schedule: Schedule, theta: np.ndarray, *, tolerance: float | None = None, most_rank: int = MOST_RANK
+    model: Model, schedule: Schedule, theta: np.ndarray, *, tolerance: float | None = None, most_rank: int = MOST_RANK,
+    choices: Choices | None = None,
 ) -> Prepared:
     """Return the programs of the formulas.
 
@@ -32,13 +34,17 @@ def prepare(
         theta: values of the parameters (p,).
         tolerance: the wanted error of a mean, in standard deviations; by default 1e-3 for two and three states, 5e-3 for more.
         most_rank: the largest rank of a train; a density that needs more is reported.
+        choices: those of a run at neighbouring parameters, which are taken again; an empty `Choices()` keeps those of this run.
 
     Raises:
         InputError: another value of an option.
     """
     default = TOLERANCES[model.n > FEW_STATES] if tolerance is None else tolerance
     tolerance = real_number("tolerance", default, "a number from 1e-6 to 0.1", lambda value: 1e-6 <= value <= 0.1)
-    return Prepared(system_of(model), np.asarray(theta, float), schedule, tolerance, whole_number("most_rank", most_rank, 2, 200))
+    if not isinstance(choices, Choices | None):
+        raise InputError("choices: expected what `fit` keeps of a run, or nothing")
+    rank, system = whole_number("most_rank", most_rank, 2, 200), system_of(model)
+    return Prepared(system, np.asarray(theta, float), schedule, tolerance, rank, None if system.kicked else choices)
 
 
 BOUNDS = {
@@ -62,7 +68,7 @@ METHOD: Method[Prepared, State] = Method(
     exactness="convergent: tensor trains of quintic B-splines in a frame that follows the density; of second order in a substep, "
     "which is audited",
     theorem=theorem,
-    options={"tolerance": None, "most_rank": MOST_RANK},
+    options={"tolerance": None, "most_rank": MOST_RANK, "choices": None},
     prepare=prepare,
     init=init,
     step=step,
@@ -70,7 +76,7 @@ METHOD: Method[Prepared, State] = Method(
     state=State,
     bounds=BOUNDS,
     differentiable=False,
-    by_values=True,
+    by_values=Choices,
     backward=BACKWARD,
     valid=valid,
     shorter="raise the option tolerance (command: --option tolerance=...)",

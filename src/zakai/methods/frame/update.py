@@ -11,7 +11,7 @@ import numpy as np
 from zakai.methods.frame.build import CLOUD, Builder
 from zakai.methods.frame.chain import Prediction
 from zakai.methods.frame.placement import Mass
-from zakai.methods.frame.state import Unresolved
+from zakai.methods.frame.state import Choice, Unresolved
 from zakai.methods.particles.programs import Array
 from zakai.numerics.trains.carried import Carried, Likelihood
 from zakai.numerics.trains.train import Train
@@ -24,13 +24,18 @@ OFF_CENTRE, NARROW, WIDE = 0.5, 0.6, 1.6  # shift and deviation of a density in 
 
 
 class Updated(NamedTuple):
-    """A density of mass one, the log of the evidence, the share of the points left, the powers taken, and the prediction used."""
+    """A density of mass one, the log of the evidence, the share of the points left, the powers taken, and the prediction used.
+
+    `top` is the log of the largest likelihood, `choice` how the density was built where choices are kept.
+    """
 
     density: Train
     log_evidence: float
     effective: float
     powers: int
     prediction: Carried
+    top: float
+    choice: Choice | None
 
 
 def update(builder: Builder, prediction: Prediction, likelihood: Likelihood) -> Updated:
@@ -41,7 +46,7 @@ def update(builder: Builder, prediction: Prediction, likelihood: Likelihood) -> 
     motion, mass = builder.prepared.motion, prediction.mass
     if not likelihood.counted.any():
         v, _ = builder.build(prediction.function, mass)
-        return _normalised(v, prediction, 0.0, 1.0, 0)
+        return _normalised(builder, v, prediction, 0.0, 1.0, 0)
     logs = motion.logs(likelihood, mass.points)
     if not np.isfinite(logs).any():
         raise Unresolved("the observation is impossible everywhere in the predicted density")
@@ -62,7 +67,7 @@ def update(builder: Builder, prediction: Prediction, likelihood: Likelihood) -> 
     v, top = _product(builder, prediction, mass, likelihood, 1.0, 1.0)
     if _off_centre(v):
         v, top = _product(builder, prediction, Mass(*v.cloud(CLOUD)), likelihood, 1.0, 1.0)
-    return _normalised(v, prediction, top, effective, powers)
+    return _normalised(builder, v, prediction, top, effective, powers)
 
 
 def _finite(logs: Array) -> Array:
@@ -81,12 +86,14 @@ def _product(
     return v, top
 
 
-def _normalised(v: Train, prediction: Prediction, top: float, effective: float, powers: int) -> Updated:
+def _normalised(
+    builder: Builder, v: Train, prediction: Prediction, top: float, effective: float, powers: int
+) -> Updated:
     total = v.mass
     if not total > 0 or not math.isfinite(total):
         raise Unresolved(f"the density has mass {total:.1g} after the observation")
     log_evidence = math.log(total) + top + prediction.log_scale
-    return Updated(v.scaled(1.0 / total), log_evidence, effective, powers, prediction.function)
+    return Updated(v.scaled(1.0 / total), log_evidence, effective, powers, prediction.function, top, builder.choice(v))
 
 
 def _off_centre(v: Train) -> bool:
