@@ -222,10 +222,10 @@ def _step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[Stat
     present, floor = max(loss - own_loss - control.floor, 0.0), FORGOTTEN * control.floor
     excess, known = control.excess + present, FORGOTTEN * control.known + control.present
     remembered = FORGOTTEN * control.remembered + min(control.present, present)
-    lasting = present * known / (known - remembered) if remembered < known else np.inf
+    future = present * known / (known - remembered) if remembered < known else np.inf
     losses, work, rate = control.losses + loss, control.work + STEP_WORK + len(done.noise), control.rate
     cost = cloud.window.width * (1.0 + MOVE_CONTROL[1] / max(rate, LEAST_RATE))
-    worth = min(MOVE_WORTH * excess, lasting)
+    worth = min(MOVE_WORTH * excess, future)
     if loss > MOVE_GAIN * (own_loss + floor) and worth * work > cost * losses and cloud.window.width:
         cloud, acceptance, doubtful_move = _moved(prepared, cloud, weights, number)
         weights = np.exp(cloud.logs)
