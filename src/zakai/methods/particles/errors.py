@@ -53,7 +53,8 @@ class Genealogy(NamedTuple):
 
     def resampled(self, ancestors: Array, weights: Array) -> Genealogy:
         """Return the genealogy after systematic resampling with these weights (N,)."""
-        share = np.mod(len(ancestors) * weights, 1.0)
+        number = len(ancestors) * weights
+        share = number - np.floor(number)
         noise = float(np.sum(share * (1.0 - share))) / len(ancestors) ** 2
         return self._replace(
             parents=(*self.parents[1:], ancestors), sizes=(*self.sizes[1:], len(weights)), rounding=(*self.rounding[1:], noise),

@@ -61,20 +61,21 @@ FEW_FAMILIES = 20  # of the oldest generation that is looked back to, below whic
 # The past is moved where that pays: by error^2 x time, with N variance of a mean, in variances of the state, as error^2.  What
 # ancestors add to that, beyond what the last move left, is taken away from later steps, and as the ancestors that are lost before
 # a move cannot come back, `MOVE_WORTH` times as much as has added up since the last one counts (error^2 x time of eleven systems
-# is about equal with 8, that of most is more with 2).  That is compared with its cost, both as shares of all so far.  A move
-# waits until it can divide the present loss by `MOVE_GAIN`, and longer where the last one had gained less; what that left is
-# forgotten at a rate.  The cost is counted in normal numbers: those of the window, once and for each sweep by the acceptance of
-# the last move, and in a step its own and as many as the rest of it takes.  (Measured on seven systems: 30 to 38 ns a number in a
-# move, 0.3 us and 40 ns a number in a step.)
+# is about equal with 8, that of most is more with 2), but no more than the present one adds up to until the state has forgotten
+# it: the share that a step leaves is measured.  That is compared with its cost, both as shares of all so far.  A move waits until
+# it can divide the present loss by `MOVE_GAIN`, and longer where the last one had gained less; what that left is forgotten at a
+# rate.  The cost is counted in normal numbers: those of the window, once and for each sweep by the acceptance of the last, and
+# in a step its own and as many as the rest of it takes.  (Measured: 30 to 38 ns in a move, 0.3 us and 40 ns a number in a step.)
 MOVE_GAIN, MOVE_WORTH, FORGOTTEN, STEP_WORK, LEAST_RATE = 1.5, 4.0, 0.98, 8.0, 0.3
 MOVE_CONTROL = (1.0, 1.2, 4.0, 0.4, 1.0)  # power, change, most sweeps, rho, share
 VARIANCE = 5.0  # that of a mean times N, in variances of the state, that the number of particles is chosen for
 MOST_GROWTH = 4
 REPEATED, NARROWEST = 2.0, 0.02  # excess of the time error at which an interval is repeated, and least narrowing that counts
-# Of the time error: the share of the allowed one below which it holds in so many more intervals, in how many it does where it was
-# no more than so many times the substeps that were expected, and the ratio of errors by length up to which it holds.  It does not
-# where the drift moves the mean by more than a deviation in the interval, and so many times as fast as where it was measured.
-SURE, TRUSTED, TRUSTED_LESS, FORESEEN, LONGER, FASTER = 0.5, 4, 1, 1.3, 4.0, 2.0
+# Of the time error: the share of the allowed one below which it holds in so many more intervals; in how many it does at most,
+# twice as many each time, where it was no more than so many times the substeps that were expected; the ratio of errors by length
+# up to which it holds.  It does not where the drift moves the mean by more than a deviation in the interval, and so many times as
+# fast as where it was measured.
+SURE, TRUSTED, MOST_TRUSTED, FORESEEN, LONGER, FASTER = 0.5, 4, 8, 1.3, 4.0, 2.0
 CARRIED = 64  # particles by which a shift of the mean is carried through an interval
 
 
@@ -101,7 +102,7 @@ def _at_start(prepared: Prepared, particles: Array, first: Array, gaussian: tupl
     width = system.law.width if system.law is not None else system.factor.width  # type: ignore[union-attr]
     window = Window.begin(particles, first, gaussian, (width, len(prepared.motion.law[3])))
     logs, nothing = np.full(count, -np.log(count)), np.zeros(system.n)
-    control = Control(0, 1, 4, 0.0, 0.0, 0, 1.0, VARIANCE, 0.0, 0.0, 0.0, 0.0, 1.0, 0, 0.0, 0.0)
+    control = Control(0, 1, 4, 0.0, 0.0, 0, 0, 1.0, VARIANCE, 0.0, 0.0, 0.0, 0.0, 1.0, 0, 0.0, 0.0, 0.0, 0.0, 0.0)
     return State(particles, logs, window, Genealogy.begin(count), control, nothing, nothing, np.ones(system.n))
 
 
@@ -218,15 +219,19 @@ def _step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[Stat
     loss, own_loss = (_loss(part, cov, len(weights)) for part in (found.largest, found.means[0]))
     if done.unseen:  # what is lost now does not come back by the noise of later intervals
         own_loss = min(own_loss, 1.0)
-    floor, excess = FORGOTTEN * control.floor, control.excess + max(loss - own_loss - control.floor, 0.0)
+    present, floor = max(loss - own_loss - control.floor, 0.0), FORGOTTEN * control.floor
+    excess, known = control.excess + present, FORGOTTEN * control.known + control.present
+    remembered = FORGOTTEN * control.remembered + min(control.present, present)
+    future = present * known / (known - remembered) if remembered < known else np.inf
     losses, work, rate = control.losses + loss, control.work + STEP_WORK + len(done.noise), control.rate
     cost = cloud.window.width * (1.0 + MOVE_CONTROL[1] / max(rate, LEAST_RATE))
-    if loss > MOVE_GAIN * (own_loss + floor) and MOVE_WORTH * excess * work > cost * losses and cloud.window.width:
+    worth = min(MOVE_WORTH * excess, future)
+    if loss > MOVE_GAIN * (own_loss + floor) and worth * work > cost * losses and cloud.window.width:
         cloud, acceptance, doubtful_move = _moved(prepared, cloud, weights, number)
         weights = np.exp(cloud.logs)
         mean, deviations, cov, own = moments_of(system, cloud.particles, weights)
         found = variances(cloud.genealogy, weights, deviations)
-        excess, work, moved, rate = 0.0, work + cost, 1.0, acceptance
+        excess, present, work, moved, rate = 0.0, 0.0, work + cost, 1.0, acceptance
         remains = _loss(found.largest, cov, len(weights))
         floor = (remains - _loss(found.means[0], cov, len(weights))) * max(1.0, MOVE_GAIN * remains / loss) ** 2
         doubtful = doubtful or doubtful_move
@@ -235,8 +240,8 @@ def _step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[Stat
     contraction = np.where(done.predicted > 0, np.minimum(1.0, own / np.maximum(done.predicted, 1e-300)) ** 2, 1.0)
     shift = (_carried(prepared, events, state) if state.shift.any() else 0.0) + steps.shift
     # A shifted prediction changes the log density of an observation by the shift times an innovation.
-    known = np.maximum(done.deviations, 1e-300)
-    shifted = control.shifted + float(((shift[:n] / known) ** 2 * (1.0 - contraction[:n])).max())
+    spreads = np.maximum(done.deviations, 1e-300)
+    shifted = control.shifted + float(((shift[:n] / spreads) ** 2 * (1.0 - contraction[:n])).max())
     shift = shift * contraction
     genealogy, evidence = of_log_likelihood(cloud.genealogy, found)
     cloud, evidence = cloud._replace(genealogy=genealogy), evidence + shifted
@@ -262,7 +267,7 @@ def _step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[Stat
     variance = 0.8 * control.variance + 0.2 * len(weights) * float(share.mean())
     control = control._replace(
         interval=number, narrow=found_narrow, variance=variance, losses=losses, work=work, excess=excess, floor=floor, rate=rate,
-        doubtful_until=until, shifted=shifted,
+        doubtful_until=until, shifted=shifted, present=present, known=known, remembered=remembered,
     )  # fmt: skip
     return State(cloud.particles, cloud.logs, cloud.window, cloud.genealogy, control, shift, *last), info
 
@@ -300,9 +305,12 @@ def _steps(
     found = steps_of(prepared.motion, interval, values, pilots, guess)
     count, stages = found.scheme
     expected = count * np.sqrt(found.error / allowed) <= FORESEEN * needed
-    trusted = TRUSTED if found.surely <= SURE * allowed else TRUSTED_LESS if expected else 0
+    trusted = min(max(1, 2 * control.granted), MOST_TRUSTED) if expected else 0
+    trusted = max(trusted, TRUSTED) if found.surely <= SURE * allowed else trusted
     trusted = 0 if jumps else trusted  # of other inputs than those that the next interval begins with
-    return found, control._replace(substeps=count, stages=stages, error=found.error, length=length, trusted=trusted, pace=pace)
+    return found, control._replace(
+        substeps=count, stages=stages, error=found.error, length=length, trusted=trusted, granted=trusted, pace=pace
+    )
 
 
 def _carried(prepared: Prepared, events: Events, state: State) -> Array:
@@ -414,7 +422,7 @@ def _guided(
     prepared: Prepared, target: Target, cloud: Cloud, plain: Advanced, gaussian: Any, number: int
 ) -> Drawn | None:
     """Return the particles whose noise is drawn from the linearised posterior, None where that is no better."""
-    count, moving = len(cloud.logs), target.prior is not None
+    moving = target.prior is not None
     d0 = len(cloud.window.first) if moving else 0
     if _uninformed(gaussian, FIRST_WIDER if moving else 1.0):
         return None
@@ -430,7 +438,6 @@ def _guided(
         return None
     window = cloud.window._replace(first=np.ascontiguousarray(path[:d0])) if moving else cloud.window
     after = Cloud(particles, cloud.logs + logs - top, window, cloud.genealogy)
-    assert len(logs) == count
     done = plain._replace(cloud=after, gained=top, noise=np.ascontiguousarray(path[d0:]), guided=True)
     return Drawn(done, path, logs, gaussian)
 
