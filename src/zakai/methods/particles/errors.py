@@ -82,7 +82,7 @@ class Genealogy(NamedTuple):
             return self
         x = before.deviations
         for parents in self.parents[DEPTH - steps :]:
-            x = x[:, parents]
+            x = np.take(x, parents, axis=1)
         T = (after.deviations * after.weights) @ x.T @ _inverse(before.cov)
         return self._replace(excess=T @ self.excess @ T.T)
 
@@ -111,9 +111,10 @@ class Genealogy(NamedTuple):
         """Return whether many first ancestors are left, or the states forget them."""
         if self.of_founders(now).effective >= FEW_FAMILIES:
             return True
-        index, lags = np.arange(len(now.weights)), min(self.age, DEPTH)
-        for back in range(1, lags + 1):
-            index = self.parents[-back][index]
+        lags = min(self.age, DEPTH)
+        index = self.parents[-1] if lags else np.arange(len(now.weights))
+        for back in range(2, lags + 1):
+            index = np.take(self.parents[-back], index)
         recent = now.by_families(index, self.sizes[-lags] if lags else len(index))
         return not (recent.between > REMEMBERED).any()
 
