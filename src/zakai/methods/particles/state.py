@@ -6,13 +6,16 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
 
+import numpy as np
+
 from zakai.methods.particles.errors import Genealogy
 from zakai.methods.particles.interval import Interval, Motion
 from zakai.methods.particles.programs import Array
 from zakai.methods.particles.system import System, system_of
-from zakai.methods.particles.window import Window
+from zakai.methods.particles.window import Window, taken
 from zakai.models.model import Model
-from zakai.numerics.particles.random import key_of
+from zakai.numerics.particles.population import systematic
+from zakai.numerics.particles.random import key_of, uniform_number
 from zakai.records.schedule import Schedule
 
 
@@ -28,26 +31,47 @@ class Control(NamedTuple):
     of the log-likelihood by the time step.
     """
 
-    interval: int
-    substeps: int
-    stages: int
-    error: float
-    length: float
-    trusted: int
-    granted: int
-    narrow: float
-    variance: float
-    losses: float
-    work: float
-    excess: float
-    floor: float
-    rate: float
-    doubtful_until: int
-    shifted: float
-    pace: float
-    present: float
-    known: float
-    remembered: float
+    interval: int = 0
+    substeps: int = 1
+    stages: int = 4
+    error: float = 0.0
+    length: float = 0.0
+    trusted: int = 0
+    granted: int = 0
+    narrow: float = 1.0
+    variance: float = 0.0
+    losses: float = 0.0
+    work: float = 0.0
+    excess: float = 0.0
+    floor: float = 0.0
+    rate: float = 1.0
+    doubtful_until: int = 0
+    shifted: float = 0.0
+    pace: float = 0.0
+    present: float = 0.0
+    known: float = 0.0
+    remembered: float = 0.0
+
+
+class Cloud(NamedTuple):
+    """Particles with their past while a step works on them."""
+
+    particles: Array
+    logs: Array
+    window: Window
+    genealogy: Genealogy
+
+    def resampled(self, weights: Array, count: int, key: Array) -> tuple[Cloud, Array]:
+        """Return equally weighted particles by systematic resampling, and their ancestors."""
+        ancestors = np.empty(count, np.int32)
+        systematic(weights, uniform_number(key), ancestors)
+        return self.taken(ancestors, weights), ancestors
+
+    def taken(self, ancestors: Array, weights: Array) -> Cloud:
+        """Return equally weighted particles with these ancestors."""
+        logs = np.full(len(ancestors), -np.log(len(ancestors)))
+        window, genealogy = self.window.resampled(ancestors), self.genealogy.resampled(ancestors, weights)
+        return Cloud(taken(self.particles, ancestors), logs, window, genealogy)
 
 
 class State(NamedTuple):
