@@ -76,6 +76,16 @@ def test_a_computation_beside_a_run_can_be_cancelled(page: Page):  # noqa: F811
     expect(page.get_by_test_id("cancel")).to_be_visible()
 
 
+def test_a_picture_that_takes_long_is_said(page: Page):  # noqa: F811
+    page.evaluate("""() => {
+      const ask = studio.link.ask.bind(studio.link);
+      studio.link.ask = (what, ...rest) => (what === "picture" ? new Promise(() => {}) : ask(what, ...rest));
+      studio.run();
+    }""")
+    expect_status(page, "Drawing the density")
+    expect(page.get_by_test_id("cancel")).to_be_visible()
+
+
 def test_a_forecast_has_no_likelihood(page: Page):  # noqa: F811
     page.get_by_test_id("show-forecast").click()
     expect(page.locator("#verdict")).to_contain_text("forecast 100 times without observations")

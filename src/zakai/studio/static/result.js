@@ -29,6 +29,7 @@ export class Result {
   async filtered(summary) {
     this.available = new Map([["main", summary]]);
     this.name = "main";
+    if (!this.studio.running) this.studio.say("Drawing the density …");
     await this.show();
     if (!this.studio.running) this.studio.say(`Filtered ${counted(summary.observations, "observation")} with ${summary.method}.`);
   }
@@ -75,7 +76,7 @@ export class Result {
   /** Ask for what can be seen. */
   async picture(window = {}) {
     const { name, coordinate } = this, columns = Math.round(Math.min(1000, Math.max(200, byId("picture").clientWidth)));
-    const found = await this.studio.ask("picture", { name, state: coordinate, columns, ...window }, { channel: "picture" });
+    const found = await this.studio.ask("picture", { name, state: coordinate, columns, ...window }, { channel: "picture", work: true });
     if (!found) return;
     this.view.setFrame(found.arrays.frame);
     byId("picture").dataset.shown = name;
