@@ -32,6 +32,7 @@ PACKED = types.Tuple((I1, I1, I1, F1))
 TERM = types.Tuple((TRAIN, F1, PROGRAM, BOX, PATH))
 # The law, its given numbers, which terms count, and [time, power, top]; no term counts: no likelihood.
 LAW = types.Tuple((PROGRAM, F1, F1, F1))
+POINTS = 1024  # of a block, which are sorted together
 LARGEST_LOG = 500.0  # of a factor; the exponential of more is cut
 # Later observations lead into what are tails now, where an error relative to the density becomes one of the mean.  With the power
 # 1/2 of the sums (the scaling of correspondence analysis) the error of a skeleton is relative to the density, as an average over
@@ -84,56 +85,106 @@ def add_train(train: Any, x: Array, moved: bool, scale: Array, out: Array) -> No
     """Add the values of a train at points x (n, P) to `out` (P,).
 
     v <- sum_d w_d(z_k) v C_k[j + d] over the axes, times scale[0] and, if moved, exp(x[n] - scale[1]); a value that is not a
-    number counts as zero.
+    number counts as zero.  Points of a block are sorted by their cell j on each axis: four of them share what is read of a core.
     """
     centre, inverse, low, step, sizes, periods, ranks, padded, offsets, flat, mean, whitening, tail = train
     n, count = low.size, x.shape[1]
-    width = 0
-    for k in range(n + 1):
-        width = max(width, ranks[k] + 4)
-    w, v, c, y, s = np.empty(6), np.empty(width), np.zeros(6 * width), np.empty(n), np.empty(n)
-    for p in range(count):
-        for d in range(n):
-            y[d] = x[d, p] - centre[d]
-            if periods[d] > 0.0:
-                y[d] -= periods[d] * math.floor(y[d] / periods[d] + 0.5)
-        inside, square = True, 0.0
-        for k in range(n):
-            z, white = 0.0, 0.0
+    width, cells = 0, 0
+    for k in range(n):
+        width, cells = max(width, ranks[k + 1] + 4), max(cells, sizes[k] + 2 * PAD)
+    w, c, y, s = np.empty(6), np.zeros((4, 6 * width)), np.empty(n), np.empty((n, POINTS))
+    v, after = np.empty((POINTS, width)), np.empty((POINTS, width))
+    inside, alive, cell = np.empty(POINTS, np.bool_), np.empty(POINTS, np.int64), np.empty(POINTS, np.int64)
+    starts, order = np.empty(cells + 1, np.int64), np.empty(POINTS + 3 * cells, np.int64)
+    for first in range(0, count, POINTS):
+        size, used = min(POINTS, count - first), 0
+        for p in range(size):
             for d in range(n):
-                z += inverse[k, d] * y[d]
-                white += whitening[k, d] * (y[d] - mean[d])
-            s[k] = (z - low[k]) / step[k]
-            inside = inside and s[k] > -2.9 and s[k] < sizes[k] + 1.9
-            square += white * white
-        if square > tail[0]:
-            v[0] = tail[1] * math.exp(-0.5 * square)
-        elif not inside:
-            continue
-        else:
-            v[0] = 1.0
-        for k in range(n if square <= tail[0] else 0):
-            j = int(math.floor(s[k]))
-            taps(s[k] - j, w)
-            a, wide = ranks[k], padded[k]
-            for d in range(6):
-                for i in range(a):
-                    c[d * wide + i] = w[d] * v[i]
-                for i in range(a, wide):
-                    c[d * wide + i] = 0.0
+                y[d] = x[d, first + p] - centre[d]
+                if periods[d] > 0.0:
+                    y[d] -= periods[d] * math.floor(y[d] / periods[d] + 0.5)
+            within, square = True, 0.0
+            for k in range(n):
+                z, white = 0.0, 0.0
+                for d in range(n):
+                    z += inverse[k, d] * y[d]
+                    white += whitening[k, d] * (y[d] - mean[d])
+                s[k, p] = (z - low[k]) / step[k]
+                within = within and s[k, p] > -2.9 and s[k, p] < sizes[k] + 1.9
+                square += white * white
+            inside[p] = within or square > tail[0]
+            v[p, 0] = 1.0
+            if square > tail[0]:
+                v[p, 0] = tail[1] * math.exp(-0.5 * square)
+            elif within:
+                alive[used] = p
+                used += 1
+        for k in range(n):
+            a, b, wide = ranks[k], ranks[k + 1], padded[k]
             stride = (sizes[k] + 2 * PAD) * wide
-            base = offsets[k] + (j - 2 + PAD) * wide
-            for q in range(ranks[k + 1]):
-                row = flat[base + q * stride : base + q * stride + 6 * wide]
-                t = 0.0
-                for r in range(6 * wide):
-                    t += c[r] * row[r]
-                v[q] = t
-        value = scale[0] * v[0]
-        if moved:
-            value *= math.exp(min(x[n, p] - scale[1], LARGEST_LOG))
-        if value == value:
-            out[p] += value
+            starts[: sizes[k] + 2 * PAD + 1] = 0
+            for i in range(used):
+                cell[alive[i]] = int(math.floor(s[k, alive[i]])) - 2 + PAD
+                starts[cell[alive[i]] + 1] += 1
+            for j in range(sizes[k] + 2 * PAD):
+                starts[j + 1] = starts[j] + 4 * ((starts[j + 1] + 3) // 4)
+            total = starts[sizes[k] + 2 * PAD]
+            order[:total] = -1
+            for i in range(used):
+                p = alive[i]
+                order[starts[cell[p]]] = p
+                starts[cell[p]] += 1
+            for i in range(1, total):
+                if order[i] < 0:
+                    order[i] = order[i - 1]  # a group of four that is not full repeats its last point
+            for group in range(0, total, 4):
+                for i in range(4):
+                    p = order[group + i]
+                    taps(s[k, p] - math.floor(s[k, p]), w)
+                    for d in range(6):
+                        for q in range(a):
+                            c[i, d * wide + q] = w[d] * v[p, q]
+                        for q in range(a, wide):
+                            c[i, d * wide + q] = 0.0
+                base = offsets[k] + cell[order[group]] * wide
+                p0, p1, p2, p3 = order[group], order[group + 1], order[group + 2], order[group + 3]
+                c0, c1, c2, c3 = c[0], c[1], c[2], c[3]
+                q = 0
+                while q + 1 < b:
+                    one = flat[base + q * stride : base + q * stride + 6 * wide]
+                    two = flat[base + (q + 1) * stride : base + (q + 1) * stride + 6 * wide]
+                    s0 = s1 = s2 = s3 = t0 = t1 = t2 = t3 = 0.0
+                    for r in range(6 * wide):
+                        s0 += c0[r] * one[r]
+                        s1 += c1[r] * one[r]
+                        s2 += c2[r] * one[r]
+                        s3 += c3[r] * one[r]
+                        t0 += c0[r] * two[r]
+                        t1 += c1[r] * two[r]
+                        t2 += c2[r] * two[r]
+                        t3 += c3[r] * two[r]
+                    after[p0, q], after[p1, q], after[p2, q], after[p3, q] = s0, s1, s2, s3
+                    after[p0, q + 1], after[p1, q + 1], after[p2, q + 1], after[p3, q + 1] = t0, t1, t2, t3
+                    q += 2
+                if q < b:
+                    one = flat[base + q * stride : base + q * stride + 6 * wide]
+                    s0 = s1 = s2 = s3 = 0.0
+                    for r in range(6 * wide):
+                        s0 += c0[r] * one[r]
+                        s1 += c1[r] * one[r]
+                        s2 += c2[r] * one[r]
+                        s3 += c3[r] * one[r]
+                    after[p0, q], after[p1, q], after[p2, q], after[p3, q] = s0, s1, s2, s3
+            for i in range(used):
+                for q in range(b):
+                    v[alive[i], q] = after[alive[i], q]
+        for p in range(size):
+            if inside[p]:
+                value = scale[0] * v[p, 0]
+                if moved:
+                    value *= math.exp(min(x[n, first + p] - scale[1], LARGEST_LOG))
+                if value == value:
+                    out[first + p] += value
 
 
 @helper
