@@ -22,17 +22,17 @@ from zakai.numerics.trains.grid import PAD, taps
 Array = Any
 # Times at both ends of each step (E, 2), and the given numbers there (E, 2, L).
 PATH = types.Tuple((F2, F3))
-# Centre, inverse of the basis, low, step, sizes; periods (0 or 2 pi); ranks (n + 1,), their padded values, offsets, coefficients;
-# of the Gaussian that stands for the tails the mean less the centre, the inverse of a root of the covariance, and [square of the
-# radius where it begins, largest value].
-TRAIN = types.Tuple((F1, F2, F1, F1, I1, F1, I1, I1, I1, F1, F1, F2, F1))
+# Centre, inverse of the basis, low, step, sizes; periods (0 or 2 pi); ranks (n + 1,), offsets, coefficients (N + 2 PAD, a, b) of
+# each core; of the Gaussian that stands for the tails the mean less the centre, the inverse of a root of the covariance, and
+# [square of the radius where it begins, largest value].
+TRAIN = types.Tuple((F1, F2, F1, F1, I1, F1, I1, I1, F1, F1, F2, F1))
 # Ranks (n + 1,), sizes (n,), where each core begins (n,), and the cores in the order (N, a, b).
 PACKED = types.Tuple((I1, I1, I1, F1))
 # A train, [factor, logarithm of what it is divided by], the motion, the domain, and the path to it.
 TERM = types.Tuple((TRAIN, F1, PROGRAM, BOX, PATH))
 # The law, its given numbers, which terms count, and [time, power, top]; no term counts: no likelihood.
 LAW = types.Tuple((PROGRAM, F1, F1, F1))
-POINTS = 1024  # of a block, which are sorted together
+POINTS, TOGETHER = 1024, 64  # of a block, which are sorted, and of one product of matrices
 LARGEST_LOG = 500.0  # of a factor; the exponential of more is cut
 # Later observations lead into what are tails now, where an error relative to the density becomes one of the mean.  With the power
 # 1/2 of the sums (the scaling of correspondence analysis) the error of a skeleton is relative to the density, as an average over
@@ -85,17 +85,17 @@ def add_train(train: Any, x: Array, moved: bool, scale: Array, out: Array) -> No
     """Add the values of a train at points x (n, P) to `out` (P,).
 
     v <- sum_d w_d(z_k) v C_k[j + d] over the axes, times scale[0] and, if moved, exp(x[n] - scale[1]); a value that is not a
-    number counts as zero.  Points of a block are sorted by their cell j on each axis: four of them share what is read of a core.
+    number counts as zero.  Points of a block are sorted by their cell j on each axis: those of a cell are a product of matrices.
     """
-    centre, inverse, low, step, sizes, periods, ranks, padded, offsets, flat, mean, whitening, tail = train
+    centre, inverse, low, step, sizes, periods, ranks, offsets, flat, mean, whitening, tail = train
     n, count = low.size, x.shape[1]
     width, cells = 0, 0
     for k in range(n):
-        width, cells = max(width, ranks[k + 1] + 4), max(cells, sizes[k] + 2 * PAD)
-    w, c, y, s = np.empty(6), np.zeros((4, 6 * width)), np.empty(n), np.empty((n, POINTS))
-    v, after = np.empty((POINTS, width)), np.empty((POINTS, width))
+        width, cells = max(width, ranks[k + 1]), max(cells, sizes[k] + 2 * PAD)
+    w, c, y, s = np.empty(6), np.empty(TOGETHER * 6 * width), np.empty(n), np.empty((n, POINTS))
+    v, after = np.empty((POINTS, width)), np.empty(TOGETHER * width)
     inside, alive, cell = np.empty(POINTS, np.bool_), np.empty(POINTS, np.int64), np.empty(POINTS, np.int64)
-    starts, order = np.empty(cells + 1, np.int64), np.empty(POINTS + 3 * cells, np.int64)
+    starts, order = np.empty(cells + 1, np.int64), np.empty(POINTS, np.int64)
     for first in range(0, count, POINTS):
         size, used = min(POINTS, count - first), 0
         for p in range(size):
@@ -120,64 +120,34 @@ def add_train(train: Any, x: Array, moved: bool, scale: Array, out: Array) -> No
                 alive[used] = p
                 used += 1
         for k in range(n):
-            a, b, wide = ranks[k], ranks[k + 1], padded[k]
-            stride = (sizes[k] + 2 * PAD) * wide
+            a, b = ranks[k], ranks[k + 1]
             starts[: sizes[k] + 2 * PAD + 1] = 0
             for i in range(used):
                 cell[alive[i]] = int(math.floor(s[k, alive[i]])) - 2 + PAD
                 starts[cell[alive[i]] + 1] += 1
             for j in range(sizes[k] + 2 * PAD):
-                starts[j + 1] = starts[j] + 4 * ((starts[j + 1] + 3) // 4)
-            total = starts[sizes[k] + 2 * PAD]
-            order[:total] = -1
+                starts[j + 1] += starts[j]
             for i in range(used):
                 p = alive[i]
                 order[starts[cell[p]]] = p
                 starts[cell[p]] += 1
-            for i in range(1, total):
-                if order[i] < 0:
-                    order[i] = order[i - 1]  # a group of four that is not full repeats its last point
-            for group in range(0, total, 4):
-                for i in range(4):
-                    p = order[group + i]
+            begin = 0
+            while begin < used:
+                j, end = cell[order[begin]], begin
+                while end < used and end < begin + TOGETHER and cell[order[end]] == j:
+                    p, row = order[end], c[(end - begin) * 6 * a : (end - begin + 1) * 6 * a]
                     taps(s[k, p] - math.floor(s[k, p]), w)
                     for d in range(6):
                         for q in range(a):
-                            c[i, d * wide + q] = w[d] * v[p, q]
-                        for q in range(a, wide):
-                            c[i, d * wide + q] = 0.0
-                base = offsets[k] + cell[order[group]] * wide
-                p0, p1, p2, p3 = order[group], order[group + 1], order[group + 2], order[group + 3]
-                c0, c1, c2, c3 = c[0], c[1], c[2], c[3]
-                q = 0
-                while q + 1 < b:
-                    one = flat[base + q * stride : base + q * stride + 6 * wide]
-                    two = flat[base + (q + 1) * stride : base + (q + 1) * stride + 6 * wide]
-                    s0 = s1 = s2 = s3 = t0 = t1 = t2 = t3 = 0.0
-                    for r in range(6 * wide):
-                        s0 += c0[r] * one[r]
-                        s1 += c1[r] * one[r]
-                        s2 += c2[r] * one[r]
-                        s3 += c3[r] * one[r]
-                        t0 += c0[r] * two[r]
-                        t1 += c1[r] * two[r]
-                        t2 += c2[r] * two[r]
-                        t3 += c3[r] * two[r]
-                    after[p0, q], after[p1, q], after[p2, q], after[p3, q] = s0, s1, s2, s3
-                    after[p0, q + 1], after[p1, q + 1], after[p2, q + 1], after[p3, q + 1] = t0, t1, t2, t3
-                    q += 2
-                if q < b:
-                    one = flat[base + q * stride : base + q * stride + 6 * wide]
-                    s0 = s1 = s2 = s3 = 0.0
-                    for r in range(6 * wide):
-                        s0 += c0[r] * one[r]
-                        s1 += c1[r] * one[r]
-                        s2 += c2[r] * one[r]
-                        s3 += c3[r] * one[r]
-                    after[p0, q], after[p1, q], after[p2, q], after[p3, q] = s0, s1, s2, s3
-            for i in range(used):
-                for q in range(b):
-                    v[alive[i], q] = after[alive[i], q]
+                            row[d * a + q] = w[d] * v[p, q]
+                    end += 1
+                base, group = offsets[k] + j * a * b, end - begin
+                matrix = flat[base : base + 6 * a * b].reshape(6 * a, b)
+                np.dot(c[: group * 6 * a].reshape(group, 6 * a), matrix, after[: group * b].reshape(group, b))
+                for i in range(group):
+                    for q in range(b):
+                        v[order[begin + i], q] = after[i * b + q]
+                begin = end
         for p in range(size):
             if inside[p]:
                 value = scale[0] * v[p, 0]
