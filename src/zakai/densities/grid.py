@@ -53,6 +53,8 @@ class GridDensity(WeightedPoints):
     @cached_property
     def _closed(self) -> tuple[bool, ...]:
         """Which axes of the grid go once around the circle."""
+        if not any(self.periodic):
+            return (False,) * len(self.periodic)
         turn = self.basis @ np.diag(self.log_values.shape)
         return tuple(
             angle and np.allclose(turn[:, i], 2 * np.pi * np.eye(len(self.names))[i], atol=1e-9)

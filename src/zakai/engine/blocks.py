@@ -30,8 +30,8 @@ def record_of_block(record: Record, block: IndependentBlock) -> Record:
     return Record(record.times, values, record.kind, record.inputs if block.model.inputs else None)
 
 
-def joined_blocks(model: Model, division: Division, runs: Sequence[Run]) -> FilterResult:
-    """Return the result of the whole system, from one run for each block."""
+def joined_blocks(model: Model, division: Division, runs: Sequence[Run], warned: bool = True) -> FilterResult:
+    """Return the result of the whole system, from one run for each block; its warnings are sought where it is `warned`."""
     blocks, parts = division.blocks, []
     mean = np.empty((len(runs[0].record) + 1, model.n))
     variance = np.empty_like(mean)
@@ -40,7 +40,7 @@ def joined_blocks(model: Model, division: Division, runs: Sequence[Run]) -> Filt
     health: dict[str, np.ndarray] = {}
     bounds: dict[str, tuple[float, str]] = {}
     for run, block in zip(runs, blocks, strict=True):
-        part = result_of_run(run, division.why, division.conditions[block.model])
+        part = result_of_run(run, division.why, division.conditions[block.model], warned)
         _rename(part, block)
         parts.append(part)
         mean[:, block.states], variance[:, block.states] = part.mean, part.variance

@@ -128,9 +128,9 @@ def _filter(
 
 
 def filter_planned(
-    plans: Sequence[Plan], records: Sequence[Record], keep: str | None, progress: Progress | None
+    plans: Sequence[Plan], records: Sequence[Record], keep: str | None, progress: Progress | None, warned: bool = True
 ) -> list[FilterResult]:
-    """Return the result of every record by its plan."""
+    """Return the result of every record by its plan; what only gives warnings is checked where it is `warned`."""
     if keep not in (None, "densities", "moments"):
         raise InputError(f'keep: "{keep}" is neither "densities" nor "moments"')
     runs = [plan.runs(one, keep, KEPT_BYTES / len(records)) for plan, one in zip(plans, records, strict=True)]
@@ -138,7 +138,7 @@ def filter_planned(
     filter_all(flat, progress, len(flat) / len(records))
     results = []
     for plan, one, of_one in zip(plans, records, runs, strict=True):
-        results.append(plan.result(of_one))
+        results.append(plan.result(of_one, warned))
         results[-1].record = one
         results[-1].warnings[:0] = [one._note] if one._note else []
     return results

@@ -58,12 +58,19 @@ class Plan(NamedTuple):
             for setting, block in zip(self.settings, self.blocks, strict=True)
         ]
 
-    def result(self, runs: Sequence[Run]) -> FilterResult:
-        """Return the result of the runs, with what continues it: the plan, and the last state of each run."""
+    def at(self, theta: np.ndarray) -> Plan:
+        """Return the plan for other values of the parameters; it was made with `by_value` false where it has several blocks."""
+        return self._replace(settings=tuple(setting._replace(theta=theta) for setting in self.settings))
+
+    def result(self, runs: Sequence[Run], warned: bool = True) -> FilterResult:
+        """Return the result of the runs, with what continues it: the plan, and the last state of each run.
+
+        Where it is not `warned`, nothing is checked that only gives warnings.
+        """
         if self.division is None:
-            result = result_of_run(runs[0], self.why, self.considered)
+            result = result_of_run(runs[0], self.why, self.considered, warned)
         else:
-            result = joined_blocks(self.model, self.division, runs)
+            result = joined_blocks(self.model, self.division, runs, warned)
         result.warnings.extend(notes_on_increments(result.times, result.increment_law_error))
         result.origin = self, tuple(run.state for run in runs)
         return result

@@ -17,13 +17,14 @@ from zakai.notes.misfit import notes_on_law
 from zakai.notes.model import notes_on_domain, notes_on_formulas
 
 
-def result_of_run(run: Run, why: str, considered: Mapping[str, tuple[Condition, ...]]) -> FilterResult:
+def result_of_run(run: Run, why: str, considered: Mapping[str, tuple[Condition, ...]], warned: bool = True) -> FilterResult:
     """Return the result of a run that has filtered its record.
 
     Args:
         run: the run.
         why: on what grounds its method was chosen.
         considered: the conditions of every method that was checked.
+        warned: whether to look for reasons to warn, which may take a second run.
     """
     model, method = run.setting.model, run.setting.method
     first_mean, first_cov = run.start_moments()
@@ -31,7 +32,8 @@ def result_of_run(run: Run, why: str, considered: Mapping[str, tuple[Condition, 
     cov = np.concatenate([first_cov[None], infos.cov])
     kept = len(run.states) == len(run.schedule) + 1
     theta, (noted, schedule) = run.setting.theta.real, run.noted
-    distances = distances_of_lengths(noted, theta, schedule, infos)
+    distances = distances_of_lengths(noted, theta, schedule, infos) if warned else None
+    samples = model.observation_kind == "samples"
     result = FilterResult(
         times=np.concatenate([[model.start], run.record.times]),
         mean=np.concatenate([first_mean[None], infos.mean]),
@@ -46,7 +48,7 @@ def result_of_run(run: Run, why: str, considered: Mapping[str, tuple[Condition, 
         conditions=considered,
         bounds={name: bound for name, bound in method.bounds.items() if name in infos.health},
         state=model.state,
-        increment_law_error=None if model.observation_kind == "samples" else np.cumsum(np.append(0.0, distances.shortfall)),
+        increment_law_error=None if distances is None or samples else np.cumsum(np.append(0.0, distances.shortfall)),
         attributes={"source": method.source, "exactness": method.exactness, **versions()},
         mean_standard_error=_with_start(infos.mean_standard_error),
         log_likelihood_standard_error=_last(infos.log_likelihood_standard_error),
@@ -54,6 +56,8 @@ def result_of_run(run: Run, why: str, considered: Mapping[str, tuple[Condition, 
         _density=run.density if kept else None,
         _no_density=run.why_no_density(),
     )
+    if distances is None:
+        return run.complete(result)
     record = record_along(run.record, schedule)
     undefined = notes_on_formulas(noted, theta, record, result.mean, result.variance)
     undefined += notes_on_domain(noted, theta, record, result.mean, result.variance)

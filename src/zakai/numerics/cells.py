@@ -47,7 +47,7 @@ def grid_cells(log_values: Array, closed: bool, count: int) -> tuple[float, floa
         start, terms = int(summed[0]), int(summed[-1] - summed[0] + 1)
     within = max(1, math.ceil(2.0 * (high - low) / count))  # two points for each of the grid
     out, cell = np.empty(count), (high - low) / count
-    signed = np.take(values, np.arange(start, start + terms), mode="wrap")
+    signed = np.take(values, np.arange(start, start + terms), mode="wrap") if closed else values[start : start + terms]
     signed[1::2] *= -1.0
     _interpolate(signed, size if closed else 0, start, low, cell, within, out)
     return low, high, out

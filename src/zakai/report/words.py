@@ -70,7 +70,7 @@ def health_bound(result: Any, name: str) -> float | None:
 def health_span(values: Any) -> str:
     """Return the range and the median of a figure over the run."""
     finite = np.asarray(values, dtype=float)
-    finite = finite[np.isfinite(finite)]
+    finite = finite[np.isfinite(finite)] + 0.0  # no negative zero
     if finite.size == 0:
         return "No value was recorded."
     if np.ptp(finite) == 0:
@@ -144,11 +144,14 @@ def verdict(result: Any) -> str:
     if by_blocks:
         methods = result.method.removeprefix("blocks: ")
         text = f"{estimate(result)}A method for each of {count(len(by_blocks), 'independent block')} ({methods})"
-    total = signed(f"{result.log_likelihood:,.2f}")
-    done = "smoothed" if kind_of(result) == "smoothed" else "filtered"
-    text += f" {done} {count(observations, 'observation')} with a log-likelihood of {total}"
-    if observations:
-        text += f" ({signed(f'{result.log_likelihood / observations:.3f}')} per observation)"
+    if kind_of(result) == "forecast":
+        text += f" forecast {count(observations, 'time')} without observations"
+    else:
+        total = signed(f"{result.log_likelihood:,.2f}")
+        done = "smoothed" if kind_of(result) == "smoothed" else "filtered"
+        text += f" {done} {count(observations, 'observation')} with a log-likelihood of {total}"
+        if observations:
+            text += f" ({signed(f'{result.log_likelihood / observations:.3f}')} per observation)"
     warned = len(result.warnings)
     text += f"; it raised {count(warned, 'warning')}, below." if warned else "; it raised no warning."
     kind = exactness(result)

@@ -159,6 +159,7 @@ def described(model: Model, found: Given) -> tuple[dict[str, Any], dict[str, np.
         "unobserved": int(missing.all(axis=1).sum()),
         "step": median,
         "longest": float(steps.max()) if len(steps) else None,
+        "longest_from": float(record.times[np.argmax(steps)]) if len(steps) else None,
         "irregular": bool(len(steps) and np.ptp(steps) > 1e-6 * abs(median or 1.0)),
         "unit": record.unit,
         "origin": None if record.clock is None else str(record.clock.origin)[:19],

@@ -6,20 +6,13 @@ import itertools
 from collections.abc import Callable, Mapping
 from typing import Any
 
-import numpy as np
-
-from zakai import _registry
 from zakai.engine.driver import filter as run_filter
 from zakai.errors import InputError
-from zakai.models.model import Model
 from zakai.records import Record
 from zakai.report import words
 from zakai.studio import pictures
 from zakai.studio.session import Answer, Held, Report, Session, state_of
 
-COARSE, FEW = 1e-2, 400  # tolerance, and most columns of the picture, while a slider is dragged
-WHOLE = 3_000  # rows that are filtered from the start while a slider is dragged; of more, those that are seen
-BEFORE = 200  # rows before the first that is seen, in which the start of a part is forgotten
 MOST_PAIRS = 45
 
 
@@ -108,47 +101,6 @@ def joint(session: Session, request: Mapping[str, Any], report: Report) -> Answe
     return {}, pictures.joint_picture(held.result, pair, held.truth)
 
 
-def slide(session: Session, request: Mapping[str, Any], report: Report) -> Answer:
-    """Filter what is seen with other values of the parameters, coarsely, and return its picture."""
-    held = session.held(request)
-    model = session.model(request)
-    view = pictures.View.of(request)
-    view = view._replace(columns=min(view.columns, FEW))
-    method, options = coarse(held.result, *method_of(request))
-    part, record, whole = part_of(held, model, view)
-    result = run_filter(part, record, method, **options)
-    extent = float(held.result.times[0]), float(held.result.times[-1])
-    arrays = pictures.density_picture(result, state_of(result, request), held.truth, view, extent)
-    return {"log_likelihood": result.log_likelihood if whole else None}, arrays
-
-
-def coarse(result: Any, method: str, options: dict[str, Any]) -> tuple[str, dict[str, Any]]:
-    """Return the method of a result, so that none is looked for, and a coarse tolerance where it has one."""
-    if method == "auto" and result.method in _registry.METHODS:
-        method = result.method
-    names = [method] if method in _registry.METHODS else [block.method for block in result.blocks]
-    if any("tolerance" in _registry.load(name).options for name in names if name in _registry.METHODS):
-        given = options.get("tolerance")
-        options = {**options, "tolerance": max(COARSE, given) if isinstance(given, float) else COARSE}
-    return method, options
-
-
-def part_of(held: Held, model: Model, view: pictures.View) -> tuple[Model, Record, bool]:
-    """Return the model and the rows up to the end of a view, and whether these are all.
-
-    Of a long record they begin a little before the view, with the density that the result has there.
-    """
-    record = held.given.record
-    first, last = view.window or (record.times[0], record.times[-1])
-    stop = min(len(record), int(np.searchsorted(record.times, last)) + 1)
-    start = max(0, int(np.searchsorted(record.times, first)) - BEFORE)
-    result = held.result
-    if stop <= WHOLE or start == 0 or record.kind == "path" or not result.has_densities:
-        return model, rows_of(record, 0, stop), stop == len(record)
-    later = model.with_prior(result.density(start), start=float(result.times[start]))
-    return later, rows_of(record, start, min(stop, start + BEFORE + WHOLE)), False
-
-
 def rows_of(record: Record, start: int, stop: int) -> Record:
     """Return some rows of a record, with its inputs."""
     if start == 0 and stop == len(record):
@@ -157,4 +109,4 @@ def rows_of(record: Record, start: int, stop: int) -> Record:
     return Record(record.times[start:stop], record.values[start:stop], record.kind, record.inputs, **clock)
 
 
-TASKS: dict[str, Callable[..., Answer]] = {"run": run, "picture": picture, "joint": joint, "slide": slide}
+TASKS: dict[str, Callable[..., Answer]] = {"run": run, "picture": picture, "joint": joint}

@@ -6,12 +6,13 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from zakai.errors import InputError
-from zakai.studio import after, exports, inspecting, running, stream
+from zakai.studio import after, exports, inspecting, running, sliding, stream
 from zakai.studio.session import Answer, Report, Session
 
 TASKS: dict[str, Callable[..., Answer]] = {
     **inspecting.TASKS,
     **running.TASKS,
+    **sliding.TASKS,
     **after.TASKS,
     **exports.TASKS,
     **stream.TASKS,

@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -32,7 +34,8 @@ FINER = 0.7  # factor of the spacing that the lines ask for: they do not see eve
 HALF_TURN = 0.45  # reach of an angle in turns, from which its axis is closed
 
 
-class Mass(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class Mass:
     """Points x (n, P) of a density, with weights (P,) that sum to one."""
 
     points: Array
@@ -40,6 +43,10 @@ class Mass(NamedTuple):
 
     def moments(self) -> tuple[Array, Array]:
         """Return the mean (n,) and the covariance (n, n)."""
+        return self._moments
+
+    @cached_property
+    def _moments(self) -> tuple[Array, Array]:
         mean = self.points @ self.weights
         apart = self.points - mean[:, None]
         return mean, (apart * self.weights) @ apart.T
@@ -80,18 +87,19 @@ class Mass(NamedTuple):
             points[d] = c + np.remainder(points[d] - c + math.pi, 2 * math.pi) - math.pi
         return Mass(points, self.weights)
 
+    @cached_property
     def distances(self) -> Array:
-        """Return the distances (P,) from the mean in deviations, those of a Gaussian about one."""
+        """The distances (P,) from the mean in deviations, those of a Gaussian about one."""
         mean, P = self.moments()
         scale = np.maximum(np.sqrt(np.diag(P)), 1e-300)
         apart = (self.points - mean[:, None]) / scale[:, None]
         unit = P / np.outer(scale, scale) + 1e-9 * np.eye(len(P))
         return np.asarray(np.sqrt(np.sum(apart * np.linalg.solve(unit, apart), axis=0) / len(P)))
 
-    @property
+    @cached_property
     def moving(self) -> Array:
         """How much the points (P,) count for the mean: their mass, times their distance in deviations where that is above one."""
-        return np.asarray(self.weights * np.maximum(self.distances(), 1.0))
+        return np.asarray(self.weights * np.maximum(self.distances, 1.0))
 
     def control(self, count: int, tolerance: float) -> Mass:
         """Return points for checks, with weights: most in proportion to what they move the mean, the others to root of the mass.
@@ -101,7 +109,7 @@ class Mass(NamedTuple):
         """
         moving, root = self.moving, np.sqrt(self.weights)
         chance = 0.7 * moving / moving.sum() + 0.3 * root / root.sum()
-        order = np.argsort(self.distances(), kind="stable")
+        order = np.argsort(self.distances, kind="stable")
         places = (np.arange(count) + 0.5) / count
         drawn = order[np.minimum(np.searchsorted(np.cumsum(chance[order]), places), len(chance) - 1)]
         far = order[self.heavy(tolerance)[order]][-FAR:]

@@ -17,7 +17,7 @@ from zakai.methods.line.coefficients import covariance_at, resolved_parts
 from zakai.methods.line.domain import ends_of_leak
 from zakai.methods.line.gauged import by_fixed_grids, by_moving_grid
 from zakai.methods.line.kernel import kernel_of
-from zakai.methods.line.message import MOST_GRIDS, Message, covering, gauged, points_of, reliable, taper
+from zakai.methods.line.message import Message, covering, gauged, points_of, reliable, taper
 from zakai.methods.line.prepared import Prepared, State, TimeInterval
 from zakai.methods.line.report import Report
 from zakai.methods.line.transition import MOST_SUBSTEPS, Substep, parts_of_split, travel, trial_substep
@@ -26,7 +26,7 @@ from zakai.numerics.line import window as lw
 from zakai.numerics.line.backward import EXCURSION, FEWEST, ROUNDING
 from zakai.numerics.line.density import support
 from zakai.numerics.line.resolution import ROUNDING as PRECISION
-from zakai.numerics.line.resolution import SMOOTHER_SHARE, SPECTRUM_FACTOR
+from zakai.numerics.line.resolution import SMOOTHER_SHARE, SPECTRUM_FACTOR, TRIALS
 from zakai.numerics.line.window import local_polynomial
 
 Array = Any
@@ -44,7 +44,7 @@ def by_exponentials(
         accepted: the values relative to the maximum that do not count.
     """
     spacing = later.needed
-    for _ in range(MOST_GRIDS):
+    for _ in range(TRIALS):
         window = covering(later.window, 0.0, 0.0, min(spacing, state.spacing))
         values = np.exp(later.at(window.offsets) - np.max(later.logs))
         values, top, error = _transposed(prepared, values, window, interval)
@@ -173,7 +173,7 @@ def _by_modes(
     least, most = _noise(prepared, interval.k, state.origin + low, state.origin + high)
     low, high = low - EXCURSION * most, high + EXCURSION * most  # paths from one support to the other leave both
     spacing = max(later.needed, RESOLVED * least)
-    for trial in range(MOST_GRIDS):
+    for trial in range(TRIALS):
         window = covering(later.window, low, high, spacing)
         if window.size > lw.LARGE:
             return None

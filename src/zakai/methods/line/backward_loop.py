@@ -29,7 +29,6 @@ from zakai.numerics.line.steps import SPLIT, SPLIT_FACTOR
 Array = Any
 
 STRIDES = (1, 2, 4)  # points of psi in a spacing of the filter's grid
-MOST = 64  # intervals that one call filters
 APART = 32  # the ends of a grid for a decomposition are multiples of so many spacings
 
 
@@ -62,7 +61,7 @@ def back(
     if split and shared and not shared[-1].closed:
         shared.append(lw.refined(shared[-1], 2.0))  # for a kernel that is narrow in spacings
     for window in shared:
-        begin, most = k, TOGETHER if prepared.mixed else MOST
+        begin, most = k, TOGETHER
         own = states[k - first].window
         if not _holds(window, *own.offsets[[0, -1]]) or (split and window.spacing < own.spacing):
             most = 1

@@ -19,7 +19,7 @@ import numpy as np
 from scipy.special import expit
 
 from zakai.methods.line.coefficients import coefficients, covariance_at, resolved_parts
-from zakai.methods.line.message import MOST_GRIDS, SURE, Message, reliable
+from zakai.methods.line.message import LOWEST, SURE, Message, reliable
 from zakai.methods.line.model import finite
 from zakai.methods.line.prepared import Prepared, State, TimeInterval
 from zakai.methods.line.report import Report
@@ -34,8 +34,10 @@ from zakai.methods.line.transition import (
 )
 from zakai.methods.line.update import state_of
 from zakai.numerics.line import window as lw
+from zakai.numerics.line.averages import MOST_PARTS
 from zakai.numerics.line.backward import FEWEST, ROUNDING
 from zakai.numerics.line.density import support
+from zakai.numerics.line.resolution import SUPPORT, TRIALS
 
 Array = Any
 
@@ -143,13 +145,9 @@ def _logarithms(density: Array, z: Array) -> Array:
     ])
 
 
-WIDTH = 8.8  # standard deviations of psi from its mean to the ends of a grid
 MARGIN = 1.2  # of a wider grid
 ROUGH = 1e-3  # of the tolerance that noise of psi may leave
-FIXED = 1.0  # deviations by which a message may move and change its width on a fixed grid
 BEYOND = 1.3  # length of such a grid, in ranges of the product
-MOST_PARTS = 16  # of an interval
-NOISE = -32.0  # logarithm of the error of small values of a density within an interval, relative to the largest
 
 
 def by_moving_grid(
@@ -194,7 +192,7 @@ def _states(prepared: Prepared, interval: TimeInterval, cuts: list[float], state
     for first, last in zip(cuts[:-2], cuts[1:-1], strict=True):
         before = result[-1]
         propagated = by_substeps(prepared, before.values, before.window, interval.part(first, last), Report())
-        result.append(state_of(propagated.values, propagated.window, state.error, max(float(state.log_floor), NOISE)))
+        result.append(state_of(propagated.values, propagated.window, state.error, max(float(state.log_floor), LOWEST)))
     return result
 
 
@@ -204,7 +202,7 @@ def _over_part(
 ) -> tuple[Message, float] | None:  # fmt: skip
     """Return the message at the start of a part of an interval, and the error that it adds; None where this does not serve."""
     spacing, error, noise, scaled = later.needed, 0.0, 0.0, later.scaled
-    now, begin, centre, deviation, reach = None, later, later.mean, later.deviation, WIDTH * later.deviation
+    now, begin, centre, deviation, reach = None, later, later.mean, later.deviation, SUPPORT * later.deviation
     if is_fixed:  # the ends of the product
         centre, reach = 0.5 * (later.ends[0] + later.ends[1]), 0.5 * BEYOND * (later.ends[1] - later.ends[0])
     stack, count, tried = [part], 0, 0
@@ -212,9 +210,9 @@ def _over_part(
         first, last = stack.pop()
         if now is None:
             if not is_fixed:
-                reach = WIDTH * deviation
+                reach = SUPPORT * deviation
             now = placed(begin, centre, deviation, spacing, reach * MARGIN ** (tried // 2), state if is_fixed else None)
-            if now is None or tried > MOST_GRIDS:
+            if now is None or tried > TRIALS:
                 return None
             now = now._replace(scaled=scaled)
             if prepared.system.varying and last == part[1] and not tried:
@@ -276,7 +274,7 @@ def _parts(prepared: Prepared, later: Message, time: float, length: float) -> in
     """Return in how many parts an interval that ends at a time has fixed grids."""
     variance = later.deviation**2
     speed, _, growth = _flow(prepared, later.origin + later.mean, 0.1 * later.deviation, variance, time, length)
-    count = length * (abs(speed) / later.deviation + abs(growth)) / FIXED
+    count = length * (abs(speed) / later.deviation + abs(growth))  # one deviation in each
     return max(int(np.ceil(count)), 1) if count <= MOST_PARTS else MOST_PARTS + 1  # NaN too
 
 

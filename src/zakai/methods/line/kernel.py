@@ -15,7 +15,6 @@ from zakai.numerics.line.resolution import noise_bound
 
 Array = Any
 
-SAME_SPACING = 160  # points up to which the spacing of a grid is retained where it is enlarged
 NARROWEST = 1.4  # spacings that the standard deviation of a kernel must have
 MOST_GRIDS = 13
 
@@ -99,8 +98,6 @@ def _reached(values: Array, window: lw.Window, kernel: Channel, width: float, cu
     spacing = float(np.sqrt((kernel.scale.real * window.spacing) ** 2 + kernel.variance.real / 6.0))
     reach = float(np.sqrt(-2.0 * np.log(cut)))
     low, high = float(ends.min() - reach * width), float(ends.max() + reach * width)
-    if (high - low) / window.spacing < SAME_SPACING:
-        spacing = min(spacing, window.spacing)
     return lw.quantized(window, low, high, max(spacing, (high - low) / 400), most=lw.SIZES[-1])
 
 

@@ -24,6 +24,7 @@ from zakai.numerics.line.gaussian_kernels import BAND
 from zakai.numerics.line.loop import advance
 from zakai.numerics.line.modes import OWN, PLACE, STAY
 from zakai.numerics.line.product import at_nodes, nodes
+from zakai.numerics.line.resolution import TRIALS
 from zakai.numerics.line.steps import (
     CELL,
     COLUMNS,
@@ -138,7 +139,6 @@ def _mixed(prepared: Prepared, window: lw.Window, x: np.ndarray, rows: slice) ->
 
 LARGER = 0.2  # margin of a new grid, relative to the range of the density
 TOGETHER = 32  # intervals whose tables of coefficients in time are computed together
-TRIALS = 8  # grids on which a step is tried
 HEALTH = {
     "edge_mass": "edge",
     "negative_mass": "negative",

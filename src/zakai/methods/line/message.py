@@ -23,7 +23,6 @@ Array = Any
 
 FALL = 3.3  # spacings over which F falls
 HALF = 14.0  # spacings from where F is one to where it is one half
-MOST_GRIDS = 7  # that are tried, finer and finer or wider
 PAD = 28  # spacings over which F falls to zero
 FEW = 16  # larger grids have a multiple of so many points: few different sizes
 SURE = 10.0  # errors of a density from which its small values count

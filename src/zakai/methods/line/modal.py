@@ -24,9 +24,9 @@ from zakai.methods.line.update import factor_at_end, grid_check
 from zakai.numerics.line import modes as lm
 from zakai.numerics.line import window as lw
 from zakai.numerics.line.density import circular_rows, waves
-from zakai.numerics.line.grid_choice import PER, SPACING, WIDENING
+from zakai.numerics.line.grid_choice import PER, SPACING, WIDENING, coarse_grid
 from zakai.numerics.line.product import General, at_nodes, nodes, weaken
-from zakai.numerics.line.resolution import edge_bound, rounding_bound, spectrum_bound
+from zakai.numerics.line.resolution import TRIALS, edge_bound, rounding_bound, spectrum_bound
 from zakai.numerics.line.steps import COLUMNS, STATUSES, Status
 
 Array = Any
@@ -224,10 +224,13 @@ def coarsened(prepared: Prepared, values: Array, window: lw.Window, length: floa
     spacing = window.unit * 2.0 ** np.floor(np.log2(SPACING * deviation / window.unit) + 1e-9)
     wide = float(np.sqrt(np.max(covariance.real) * length))
     low, high = window.offsets[check.first] - WIDENING * wide, window.offsets[check.last] + WIDENING * wide
-    for _ in range(lm.TRIALS):
-        coarse = _grid(window, float(low - WIDENING * wide), float(high + WIDENING * wide), float(spacing))
-        decomposed = spectral(prepared, coarse) if coarse.size <= lw.LARGEST else None
-        if decomposed is None or spacing < SHARP * window.spacing:
+    for _ in range(TRIALS):
+        centre, spacing, size = coarse_grid(low, high, spacing, WIDENING * wide)
+        if not size <= lw.LARGEST or spacing < SHARP * window.spacing:
+            return None
+        coarse = window._replace(centre=float(centre), spacing=float(spacing), size=int(size))
+        decomposed = spectral(prepared, coarse)
+        if decomposed is None:
             return None
         with np.errstate(all="ignore"):
             scale = np.exp(_gauge(prepared, coarse, points) - decomposed.top)
@@ -259,14 +262,6 @@ def _remembered(prepared: Prepared, points: Array, length: float) -> float:
         return length
     rate = -2.0 * float(np.min(slope(points[:, None], prepared.model.start, prepared.theta).real))
     return float(-np.expm1(-rate * length) / rate) if rate > 0.0 else length
-
-
-def _grid(window: lw.Window, low: float, high: float, spacing: float) -> lw.Window:
-    """Return a grid out of few that covers offsets from `low` to `high`: its centre is a multiple of 16 spacings."""
-    apart = 16.0 * spacing
-    centre = apart * round(0.5 * (low + high) / apart)
-    size = lw.size_for((high - low) / spacing + 18.0)
-    return window._replace(centre=centre, spacing=spacing, size=size)
 
 
 def _gauge(prepared: Prepared, coarse: lw.Window, points: Array) -> Array:

@@ -9,11 +9,11 @@ import numpy as np
 from zakai.methods._protocol import Infos
 from zakai.methods.line.prepared import Parts, Prepared, State
 from zakai.numerics.line.density import support
+from zakai.numerics.line.resolution import SUPPORT
 from zakai.numerics.line.window import CUT, Window
 from zakai.records.schedule import Schedule
 
 WIDER = 2.0  # ranges of a density by which the noise of a part moves its ends
-REACH = 8.6  # standard deviations to the end of a density
 SUMS = ("time_error", "tolerance_ratio")  # figures of parts that add up
 
 Segment = Callable[[Prepared, slice, State, np.ndarray], tuple[Sequence[State], Infos]]
@@ -63,8 +63,8 @@ def parts_of_step(prepared: Prepared, k: int, values: np.ndarray, window: Window
     most = float(np.max(prepared.system.covariance(np.zeros((9, 1)), t, prepared.theta)[..., 0, 0]))
     first, last = support(np.ascontiguousarray(values), CUT)
     width, bounds = max(last - first, 1) * window.spacing, [start]
-    while not most * (stop - bounds[-1]) <= (WIDER * width / REACH) ** 2:
-        bounds.append(bounds[-1] + (WIDER * width / REACH) ** 2 / most)
+    while not most * (stop - bounds[-1]) <= (WIDER * width / SUPPORT) ** 2:
+        bounds.append(bounds[-1] + (WIDER * width / SUPPORT) ** 2 / most)
         width *= 1.0 + 2.0 * WIDER
     count, schedule = len(bounds) + 1, prepared.schedule
     if count == 2 and not schedule.seen[k].any():

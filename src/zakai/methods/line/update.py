@@ -27,19 +27,20 @@ from zakai.numerics.line.product import (
     Likelihood,
     Product,
     at_nodes,
+    finer,
     nodes,
     normalized,
     weak,
     weak_error,
     weaken,
 )
-from zakai.numerics.line.resolution import RESOLVED
+from zakai.numerics.line.resolution import RESOLVED, TRIALS
 from zakai.numerics.line.window import Window
 from zakai.numerics.prior_grid import mixture_log_density, prior_grid
 
 Array = Any
 
-UNRESOLVED = 1e-6  # spectrum at the highest frequencies from which waves around a density hide where it ends
+UNRESOLVED = 1e-6  # spectrum at the highest frequencies from which waves hide where a density ends, and a prior is averaged
 
 
 def resampled(prepared: Prepared, values: Array, window: lw.Window, new: lw.Window) -> Array:
@@ -216,24 +217,15 @@ def sampled_weakly(
         weaken(fine, 0, precision, observed, np.ascontiguousarray(centre), logs, change)
         product, gained, depth, growth = normalized(values, logs, np.ones(window.size), float(values.max()))
         error = 0.5 * weak_error(product, change)
-        new, covers = _finer(prepared, product, window)
-        if error <= WEAK_SHARE * prepared.tolerance or new.size > prepared.largest or not covers:
+        check = grid_check(prepared, product, window)
+        new = finer(product, window, check)
+        if error <= WEAK_SHARE * prepared.tolerance or new == window or new.size > prepared.largest:
             break
         # From the whole density: one that ends within a grid cannot be interpolated there.
         values, window = lw.resampled(*source, new), new
     rest = observed - centre
     gained = gained + constant - 0.5 * rest @ precision @ rest
-    check = grid_check(prepared, product, window)._replace(aliasing=error)
-    return Product(product, gained, depth, growth, window), check
-
-
-def _finer(prepared: Prepared, values: Array, window: lw.Window) -> tuple[lw.Window, bool]:
-    """Return a finer grid for a density, and whether that holds it with the margins of a grid that is retained."""
-    check = grid_check(prepared, values, window)
-    low, high = window.offsets[check.first], window.offsets[check.last]
-    new = lw.quantized(window, low, high, window.spacing / 2**0.5 * 1.001, margin=0.16, most=lw.SIZES[-1])
-    least = new.size // 16
-    return new, bool(new.offsets[least] <= low and high < new.offsets[-least])
+    return Product(product, gained, depth, growth, window), check._replace(aliasing=error)
 
 
 def _sample_noise(prepared: Prepared, stop: float, at_end: np.ndarray) -> tuple[Array, Any]:
@@ -277,7 +269,6 @@ def shared_noise(system: System, theta: np.ndarray, stop: float, spans: np.ndarr
 # The smallest value that counts of a prior with natural ends, relative to the largest: farther out, rounding in the transition
 # exceeds the mass, since the coefficients of the variable w grow exponentially.
 CUT_OF_DOMAIN = 1e-8
-SMOOTH = 1e-6  # spectrum at the end of that of a prior beyond which it is averaged around the grid points
 _PLACES = 256  # in a spacing, to which the place of a jump is known
 
 
@@ -345,7 +336,7 @@ def init(prepared: Prepared, prior: Any) -> State:
         origin = 0.5 * (low + high)
         window = Window(origin, 0.0, spacing, 0, False, spacing)
         window = lw.quantized(window, low - origin, high - origin, spacing, margin=0.0, most=lw.LARGE)
-    for trial in range(8):
+    for trial in range(TRIALS):
         if log_density is None:
             points = window.points[:, None]
             logs = evaluate(np.pi - np.mod(np.pi - points, 2 * np.pi) if closed else points)
@@ -356,9 +347,9 @@ def init(prepared: Prepared, prior: Any) -> State:
         values = values / np.sum(values)
         check = lw.grid_check(values, closed, cut=cut)
         new = lw.fitted(check, window, lw.LARGE)
-        if new == window or trial == 7:  # the values belong to this window
+        if new == window or trial == TRIALS - 1:  # the values belong to this window
             break
         window = new
-    if log_density is None and not closed and check.aliasing > SMOOTH:
+    if log_density is None and not closed and check.aliasing > UNRESOLVED:
         values = averaged(evaluate, window)
     return state_of(values, window, max(0.0, check.aliasing - 1e-12), -700.0)

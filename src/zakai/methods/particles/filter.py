@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from zakai.methods._protocol import Info
-from zakai.methods.particles.errors import DEPTH, Genealogy, of_log_likelihood, variances
+from zakai.methods.particles.errors import CAUTION, DEPTH, FEW_FAMILIES, Genealogy, Weighted, of_log_likelihood, variances
 from zakai.methods.particles.interval import (
     MOST_SUBSTEPS,
     MOST_TIME_ERROR,
@@ -40,7 +40,7 @@ from zakai.methods.particles.interval import (
 )
 from zakai.methods.particles.moments import moments_of
 from zakai.methods.particles.programs import Array
-from zakai.methods.particles.state import Control, Prepared, Rule, State
+from zakai.methods.particles.state import Cloud, Control, Prepared, Rule, State
 from zakai.methods.particles.window import Target, Window, taken
 from zakai.methods.system.escape_of_states import RARE, check_escape
 from zakai.numerics.particles.chunks import over_chunks
@@ -57,24 +57,24 @@ FIRST_WIDER, FIRST_ROUNDS = 1.5, 6
 INFORMED = 0.25  # log det of the linearised posterior of the noise, below which the observation says nothing about the noise
 MOST_LEVELS = 60
 FAR = 1e100  # a state that has left every bounded set
-FEW_FAMILIES = 20  # of the oldest generation that is looked back to, below which they are too few to show their spread
 # The past is moved where that pays: by error^2 x time, with N variance of a mean, in variances of the state, as error^2.  What
 # ancestors add to that, beyond what the last move left, is taken away from later steps, and as the ancestors that are lost before
 # a move cannot come back, `MOVE_WORTH` times as much as has added up since the last one counts (error^2 x time of eleven systems
-# is about equal with 8, that of most is more with 2).  That is compared with its cost, both as shares of all so far.  A move
-# waits until it can divide the present loss by `MOVE_GAIN`, and longer where the last one had gained less; what that left is
-# forgotten at a rate.  The cost is counted in normal numbers: those of the window, once and for each sweep by the acceptance of
-# the last move, and in a step its own and as many as the rest of it takes.  (Measured on seven systems: 30 to 38 ns a number in a
-# move, 0.3 us and 40 ns a number in a step.)
+# is about equal with 8, that of most is more with 2), but no more than the present one adds up to until the state has forgotten
+# it: the share that a step leaves is measured.  That is compared with its cost, both as shares of all so far.  A move waits until
+# it can divide the present loss by `MOVE_GAIN`, and longer where the last one had gained less; what that left is forgotten at a
+# rate.  The cost is counted in normal numbers: those of the window, once and for each sweep by the acceptance of the last, and
+# in a step its own and as many as the rest of it takes.  (Measured: 30 to 38 ns in a move, 0.3 us and 40 ns a number in a step.)
 MOVE_GAIN, MOVE_WORTH, FORGOTTEN, STEP_WORK, LEAST_RATE = 1.5, 4.0, 0.98, 8.0, 0.3
 MOVE_CONTROL = (1.0, 1.2, 4.0, 0.4, 1.0)  # power, change, most sweeps, rho, share
 VARIANCE = 5.0  # that of a mean times N, in variances of the state, that the number of particles is chosen for
 MOST_GROWTH = 4
 REPEATED, NARROWEST = 2.0, 0.02  # excess of the time error at which an interval is repeated, and least narrowing that counts
-# Of the time error: the share of the allowed one below which it holds in so many more intervals, in how many it does where it was
-# no more than so many times the substeps that were expected, and the ratio of errors by length up to which it holds.  It does not
-# where the drift moves the mean by more than a deviation in the interval, and so many times as fast as where it was measured.
-SURE, TRUSTED, TRUSTED_LESS, FORESEEN, LONGER, FASTER = 0.5, 4, 1, 1.3, 4.0, 2.0
+# Of the time error: the share of the allowed one below which it holds in so many more intervals; in how many it does at most,
+# twice as many each time, where it was no more than so many times the substeps that were expected; the ratio of errors by length
+# up to which it holds.  It does not where the drift moves the mean by more than a deviation in the interval, and so many times as
+# fast as where it was measured.
+SURE, TRUSTED, MOST_TRUSTED, FORESEEN, LONGER, FASTER = 0.5, 4, 8, 1.3, 4.0, 2.0
 CARRIED = 64  # particles by which a shift of the mean is carried through an interval
 
 
@@ -101,36 +101,15 @@ def _at_start(prepared: Prepared, particles: Array, first: Array, gaussian: tupl
     width = system.law.width if system.law is not None else system.factor.width  # type: ignore[union-attr]
     window = Window.begin(particles, first, gaussian, (width, len(prepared.motion.law[3])))
     logs, nothing = np.full(count, -np.log(count)), np.zeros(system.n)
-    control = Control(0, 1, 4, 0.0, 0.0, 0, 1.0, VARIANCE, 0.0, 0.0, 0.0, 0.0, 1.0, 0, 0.0, 0.0)
-    return State(particles, logs, window, Genealogy.begin(count), control, nothing, nothing, np.ones(system.n))
+    genealogy, control = Genealogy.begin(count, prepared.model.n), Control(variance=VARIANCE)
+    return State(particles, logs, window, genealogy, control, nothing, nothing, np.ones(system.n))
 
 
 def reduced(state: State) -> State:
     """Return a state with its particles, without their past."""
     nothing = np.zeros((len(state.particles), 0))
     window = Window.begin(nothing, np.zeros((0, 0)), (np.zeros(0), np.zeros((0, 0))), (0, 0))
-    return state._replace(window=window, genealogy=Genealogy.begin(0))
-
-
-class Cloud(NamedTuple):
-    """Particles with their past while a step works on them."""
-
-    particles: Array
-    logs: Array
-    window: Window
-    genealogy: Genealogy
-
-    def resampled(self, weights: Array, count: int, key: Array) -> tuple[Cloud, Array]:
-        """Return equally weighted particles by systematic resampling, and their ancestors."""
-        ancestors = np.empty(count, np.int32)
-        systematic(weights, uniform_number(key), ancestors)
-        return self.taken(ancestors, weights), ancestors
-
-    def taken(self, ancestors: Array, weights: Array) -> Cloud:
-        """Return equally weighted particles with these ancestors."""
-        logs = np.full(len(ancestors), -np.log(len(ancestors)))
-        window, genealogy = self.window.resampled(ancestors), self.genealogy.resampled(ancestors, weights)
-        return Cloud(taken(self.particles, ancestors), logs, window, genealogy)
+    return state._replace(window=window, genealogy=Genealogy.begin(0, state.genealogy.excess.shape[1]))
 
 
 class Advanced(NamedTuple):
@@ -166,7 +145,7 @@ def step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[State
 
 FIGURES = (
     "effective_sample_size", "particles", "founders", "largest_weight", "tempering_levels", "acceptance", "time_error",
-    "monte_carlo_error", "log_likelihood_error", "lower_bound", "guided", "moved", "linear_states",
+    "monte_carlo_error", "log_likelihood_error", "lower_bound", "uncertain_error", "guided", "moved", "linear_states",
 )  # fmt: skip
 
 
@@ -183,8 +162,8 @@ def _step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[Stat
     number, rule, n = control.interval + 1, prepared.rule, prepared.model.n
     cloud = Cloud(state.particles, state.log_weights, state.window, state.genealogy)
     weights = np.exp(cloud.logs)
-    before, _, cov, _ = moments_of(system, cloud.particles, weights)
-    scale = np.maximum(system.scales(cov), 1e-12)
+    before, apart, cov, _ = moments_of(system, cloud.particles, weights)
+    scale, began = np.maximum(system.scales(cov), 1e-12), Weighted(apart, weights)
     observed = _observed(prepared, interval, values)
     wanted, size = _wanted(rule, len(weights), control.variance), effective(weights)
     if size < HOPELESS * len(weights):  # more of them would be of no use
@@ -212,21 +191,31 @@ def _step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[Stat
     weights = np.exp(cloud.logs)
     size, largest = effective(weights), float(weights.max())
     mean, deviations, cov, own = after
-    found = variances(cloud.genealogy, weights, deviations)
+    found, now = variances(cloud.genealogy, weights, deviations), Weighted(deviations, weights)
+    genealogy, variance = cloud.genealogy.carried(state.genealogy.age, began, now).seen(found, now)
+    cloud = cloud._replace(genealogy=genealogy)
     doubtful = size < TEMPER_BELOW * len(weights) or done.levels > 3
     acceptance, moved = done.acceptance, 0.0
     loss, own_loss = (_loss(part, cov, len(weights)) for part in (found.largest, found.means[0]))
     if done.unseen:  # what is lost now does not come back by the noise of later intervals
         own_loss = min(own_loss, 1.0)
-    floor, excess = FORGOTTEN * control.floor, control.excess + max(loss - own_loss - control.floor, 0.0)
+    present, floor = max(loss - own_loss - control.floor, 0.0), FORGOTTEN * control.floor
+    excess, known = control.excess + present, FORGOTTEN * control.known + control.present
+    remembered = FORGOTTEN * control.remembered + min(control.present, present)
+    future = present * known / (known - remembered) if remembered < known else np.inf
     losses, work, rate = control.losses + loss, control.work + STEP_WORK + len(done.noise), control.rate
     cost = cloud.window.width * (1.0 + MOVE_CONTROL[1] / max(rate, LEAST_RATE))
-    if loss > MOVE_GAIN * (own_loss + floor) and MOVE_WORTH * excess * work > cost * losses and cloud.window.width:
+    worth = min(MOVE_WORTH * excess, future)
+    if loss > MOVE_GAIN * (own_loss + floor) and worth * work > cost * losses and cloud.window.width:
         cloud, acceptance, doubtful_move = _moved(prepared, cloud, weights, number)
         weights = np.exp(cloud.logs)
         mean, deviations, cov, own = moments_of(system, cloud.particles, weights)
-        found = variances(cloud.genealogy, weights, deviations)
-        excess, work, moved, rate = 0.0, work + cost, 1.0, acceptance
+        genealogy, began, now = cloud.genealogy, now, Weighted(deviations, weights)
+        found = variances(genealogy, weights, deviations)
+        if len(cloud.window.first) and not doubtful_move:
+            genealogy = genealogy.renewed()
+        genealogy, variance = genealogy.carried(genealogy.age - 1, began, now).seen(found, now)
+        excess, present, work, moved, rate = 0.0, 0.0, work + cost, 1.0, acceptance
         remains = _loss(found.largest, cov, len(weights))
         floor = (remains - _loss(found.means[0], cov, len(weights))) * max(1.0, MOVE_GAIN * remains / loss) ** 2
         doubtful = doubtful or doubtful_move
@@ -235,14 +224,15 @@ def _step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[Stat
     contraction = np.where(done.predicted > 0, np.minimum(1.0, own / np.maximum(done.predicted, 1e-300)) ** 2, 1.0)
     shift = (_carried(prepared, events, state) if state.shift.any() else 0.0) + steps.shift
     # A shifted prediction changes the log density of an observation by the shift times an innovation.
-    known = np.maximum(done.deviations, 1e-300)
-    shifted = control.shifted + float(((shift[:n] / known) ** 2 * (1.0 - contraction[:n])).max())
+    spreads = np.maximum(done.deviations, 1e-300)
+    shifted = control.shifted + float(((shift[:n] / spreads) ** 2 * (1.0 - contraction[:n])).max())
     shift = shift * contraction
-    genealogy, evidence = of_log_likelihood(cloud.genealogy, found)
+    genealogy, evidence = of_log_likelihood(genealogy, found)
     cloud, evidence = cloud._replace(genealogy=genealogy), evidence + shifted
     positive = np.where(spread > 0, spread, np.inf)
-    share = found.largest / positive**2
+    share, random_error = found.largest / positive**2, float(np.sqrt((variance / positive**2).max()))
     until = cloud.genealogy.age + DEPTH if doubtful else control.doubtful_until
+    marked = doubtful or genealogy.age < until or found.families[-2] < FEW_FAMILIES or not genealogy.forgotten(now)
     health = {
         "effective_sample_size": size,
         "particles": float(len(weights)),
@@ -251,18 +241,19 @@ def _step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[Stat
         "tempering_levels": float(done.levels),
         "acceptance": acceptance,
         "time_error": float((np.abs(shift[:n]) / positive).max()),
-        "monte_carlo_error": float(np.sqrt(share.max())),
+        "monte_carlo_error": random_error,
         "log_likelihood_error": float(np.sqrt(evidence)),
-        "lower_bound": float(doubtful or cloud.genealogy.age < until or found.families[-2] < FEW_FAMILIES),
+        "lower_bound": float(marked),
+        "uncertain_error": CAUTION * random_error if marked else 0.0,
         "guided": float(done.guided),
         "moved": moved,
         "linear_states": float(system.linear),
     }
-    info = Info(done.gained, mean[:n], cov, health, np.sqrt(found.largest + shift[:n] ** 2), float(np.sqrt(evidence)))
-    variance = 0.8 * control.variance + 0.2 * len(weights) * float(share.mean())
+    info = Info(done.gained, mean[:n], cov, health, np.sqrt(variance + shift[:n] ** 2), float(np.sqrt(evidence)))
     control = control._replace(
-        interval=number, narrow=found_narrow, variance=variance, losses=losses, work=work, excess=excess, floor=floor, rate=rate,
-        doubtful_until=until, shifted=shifted,
+        interval=number, narrow=found_narrow, losses=losses, work=work, excess=excess, floor=floor, rate=rate,
+        doubtful_until=until, shifted=shifted, present=present, known=known, remembered=remembered,
+        variance=0.8 * control.variance + 0.2 * len(weights) * float(share.mean()),
     )  # fmt: skip
     return State(cloud.particles, cloud.logs, cloud.window, cloud.genealogy, control, shift, *last), info
 
@@ -300,9 +291,12 @@ def _steps(
     found = steps_of(prepared.motion, interval, values, pilots, guess)
     count, stages = found.scheme
     expected = count * np.sqrt(found.error / allowed) <= FORESEEN * needed
-    trusted = TRUSTED if found.surely <= SURE * allowed else TRUSTED_LESS if expected else 0
+    trusted = min(max(1, 2 * control.granted), MOST_TRUSTED) if expected else 0
+    trusted = max(trusted, TRUSTED) if found.surely <= SURE * allowed else trusted
     trusted = 0 if jumps else trusted  # of other inputs than those that the next interval begins with
-    return found, control._replace(substeps=count, stages=stages, error=found.error, length=length, trusted=trusted, pace=pace)
+    return found, control._replace(
+        substeps=count, stages=stages, error=found.error, length=length, trusted=trusted, granted=trusted, pace=pace
+    )
 
 
 def _carried(prepared: Prepared, events: Events, state: State) -> Array:
@@ -414,7 +408,7 @@ def _guided(
     prepared: Prepared, target: Target, cloud: Cloud, plain: Advanced, gaussian: Any, number: int
 ) -> Drawn | None:
     """Return the particles whose noise is drawn from the linearised posterior, None where that is no better."""
-    count, moving = len(cloud.logs), target.prior is not None
+    moving = target.prior is not None
     d0 = len(cloud.window.first) if moving else 0
     if _uninformed(gaussian, FIRST_WIDER if moving else 1.0):
         return None
@@ -430,7 +424,6 @@ def _guided(
         return None
     window = cloud.window._replace(first=np.ascontiguousarray(path[:d0])) if moving else cloud.window
     after = Cloud(particles, cloud.logs + logs - top, window, cloud.genealogy)
-    assert len(logs) == count
     done = plain._replace(cloud=after, gained=top, noise=np.ascontiguousarray(path[d0:]), guided=True)
     return Drawn(done, path, logs, gaussian)
 

@@ -33,7 +33,7 @@ def prepare(
     schedule: Schedule,
     theta: np.ndarray,
     *,
-    tolerance: float = TOLERANCE,
+    tolerance: float | None = TOLERANCE,
     particles: int | None = None,
     most_particles: int | None = None,
     seed: int = 0,
@@ -46,6 +46,7 @@ def prepare(
         schedule: its K intervals.
         theta: values of the parameters (p,).
         tolerance: the wanted standard error of a mean, in standard deviations of the state; it decides the number of particles.
+            None is the default, as in every method.
         particles: a fixed number of particles instead.
         most_particles: the largest number; by default four times that of the start.
         seed: of the draws.
@@ -55,7 +56,8 @@ def prepare(
     Raises:
         InputError: another value of an option.
     """
-    tolerance = real_number("tolerance", tolerance, "a number from 0.001 to 0.5", lambda value: 0.001 <= value <= 0.5)
+    wanted = TOLERANCE if tolerance is None else tolerance
+    tolerance = real_number("tolerance", wanted, "a number from 0.001 to 0.5", lambda value: 0.001 <= value <= 0.5)
     seed = whole_number("seed", seed, 0, 2**63 - 1)
     most = 10**8 if most_particles is None else whole_number("most_particles", most_particles, 2, 10**8)
     if particles is not None:
@@ -102,9 +104,9 @@ def _system(model: Model, split: object) -> System:
 
 BOUNDS = {
     "monte_carlo_error": (0.1, "standard error of a mean, in standard deviations; lower the tolerance or name more particles"),
-    "lower_bound": (
-        0.5, "the standard errors are lower bounds here, because an observation left few particles or few ancestors; run another "
-        "seed and compare, or name more particles",
+    "uncertain_error": (
+        0.2, "error of a mean, in standard deviations, that is possible where the standard errors are lower bounds, because an "
+        "observation left few particles or few ancestors; run another seed and compare, or name more particles",
     ),
     "tempering_levels": (
         6.0, "powers of the likelihood that one observation needed: it is far from what was predicted; check it and its noise, "

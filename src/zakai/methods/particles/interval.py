@@ -450,6 +450,7 @@ def _coarse_noise(motion: Motion, coarse: Events, fine: Events, noise: Array) ->
     """Return the noise of the substeps that makes the same kicks as that of their halves."""
     system = motion.system
     shared = np.zeros((coarse.width, noise.shape[1]))
+    back = np.linalg.pinv(coarse.roots, rcond=1e-6) if system.kind == ADDITIVE else coarse.roots
     for j in range(len(coarse.rows)):
         first, width, coin = coarse.rows[j]
         halves = []
@@ -458,7 +459,7 @@ def _coarse_noise(motion: Motion, coarse: Events, fine: Events, noise: Array) ->
             halves.append(noise[begin : begin + own])
         if system.kind == ADDITIVE:
             moved = sum(fine.roots[2 * j + i] @ halves[i] for i in range(2))
-            shared[first : first + width] = np.linalg.pinv(coarse.roots[j], rcond=1e-6) @ moved
+            shared[first : first + width] = back[j] @ moved
         else:
             shared[first : first + width] = (halves[0] + halves[1]) / np.sqrt(2)
             if coin:

@@ -48,7 +48,12 @@ class _Instructions(Instructions):
 
     def _translate(self, expr: sp.Expr) -> tuple[str, Sequence[sp.Expr], Any]:
         special = {LogGamma: "loggamma", LogBessel: "logbessel"}
-        return (special[type(expr)], expr.args, None) if type(expr) in special else super()._translate(expr)
+        if type(expr) in special:
+            return special[type(expr)], expr.args, None
+        if isinstance(expr, sp.Mul) and len(expr.args) > 2 and expr.args[0].is_Number:
+            # What differs by a number alone is computed once.
+            return "multiply", (expr.args[0], sp.Mul(*expr.args[1:])), None
+        return super()._translate(expr)
 
 
 class Expressions:
@@ -105,9 +110,12 @@ class Expressions:
                 lines.append((_number_of(operation), slot, operands[0], operands[0], 0))
             else:
                 first = operands[0]
-                for other in operands[1:]:
-                    lines.append((_number_of(operation), slot, first, other, 0))
-                    first = slot
+                for place, other in enumerate(operands[1:], 2):
+                    # A result in a slot of its own: where it overwrites an operand, the loop over a row is not vectorised.
+                    constants.append(0.0)
+                    result = slot if place == len(operands) else count + len(constants) - 1
+                    lines.append((_number_of(operation), result, first, other, 0))
+                    first = result
         rows, numbers = table_rows([_polynomials(table, orders) for table, orders in tables])
         self._program = Program(
             np.array(lines, np.int64).reshape(-1, 5), np.array(values + constants, float),

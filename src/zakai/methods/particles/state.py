@@ -6,13 +6,16 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
 
+import numpy as np
+
 from zakai.methods.particles.errors import Genealogy
 from zakai.methods.particles.interval import Interval, Motion
 from zakai.methods.particles.programs import Array
 from zakai.methods.particles.system import System, system_of
-from zakai.methods.particles.window import Window
+from zakai.methods.particles.window import Window, taken
 from zakai.models.model import Model
-from zakai.numerics.particles.random import key_of
+from zakai.numerics.particles.population import systematic
+from zakai.numerics.particles.random import key_of, uniform_number
 from zakai.records.schedule import Schedule
 
 
@@ -20,29 +23,55 @@ class Control(NamedTuple):
     """What decides the next step beside the particles.
 
     `interval` counts intervals; `substeps` with `stages`, whose `error` was measured in an interval of this `length`, where the
-    drift moved the mean at this `pace`, and is `trusted` in so many more; `narrow` the ratio of the deviations after and before
-    the last observation, `variance` of a mean times N, `losses` the sum of its means and `work` that of steps and moves,
-    `excess` what has added up since the last move beyond `floor`, what that has left, `rate` its acceptance, `doubtful_until`
-    the number of resamplings until which standard errors are lower bounds, and `shifted` the variance of the log-likelihood by
-    the time step.
+    drift moved the mean at this `pace`, and is `trusted` in so many more of those that were `granted`; `narrow` the ratio of the
+    deviations after and before the last observation, `variance` of a mean times N, `losses` the sum of its means and `work` that
+    of steps and moves, `excess` what has added up since the last move beyond `floor`, what that has left; `present` is the part
+    of the last step, and of `known` such parts steps have left `remembered` to the next ones; `rate` is the acceptance of the
+    last move, `doubtful_until` the number of resamplings until which standard errors are lower bounds, and `shifted` the variance
+    of the log-likelihood by the time step.
     """
 
-    interval: int
-    substeps: int
-    stages: int
-    error: float
-    length: float
-    trusted: int
-    narrow: float
-    variance: float
-    losses: float
-    work: float
-    excess: float
-    floor: float
-    rate: float
-    doubtful_until: int
-    shifted: float
-    pace: float
+    interval: int = 0
+    substeps: int = 1
+    stages: int = 4
+    error: float = 0.0
+    length: float = 0.0
+    trusted: int = 0
+    granted: int = 0
+    narrow: float = 1.0
+    variance: float = 0.0
+    losses: float = 0.0
+    work: float = 0.0
+    excess: float = 0.0
+    floor: float = 0.0
+    rate: float = 1.0
+    doubtful_until: int = 0
+    shifted: float = 0.0
+    pace: float = 0.0
+    present: float = 0.0
+    known: float = 0.0
+    remembered: float = 0.0
+
+
+class Cloud(NamedTuple):
+    """Particles with their past while a step works on them."""
+
+    particles: Array
+    logs: Array
+    window: Window
+    genealogy: Genealogy
+
+    def resampled(self, weights: Array, count: int, key: Array) -> tuple[Cloud, Array]:
+        """Return equally weighted particles by systematic resampling, and their ancestors."""
+        ancestors = np.empty(count, np.int32)
+        systematic(weights, uniform_number(key), ancestors)
+        return self.taken(ancestors, weights), ancestors
+
+    def taken(self, ancestors: Array, weights: Array) -> Cloud:
+        """Return equally weighted particles with these ancestors."""
+        logs = np.full(len(ancestors), -np.log(len(ancestors)))
+        window, genealogy = self.window.resampled(ancestors), self.genealogy.resampled(ancestors, weights)
+        return Cloud(taken(self.particles, ancestors), logs, window, genealogy)
 
 
 class State(NamedTuple):

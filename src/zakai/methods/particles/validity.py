@@ -18,16 +18,18 @@ def valid(prepared: Prepared, state: State) -> bool:
     shapes = shapes and state.last_scale.shape == (n,)
     control = state.control
     shapes = shapes and control.stages in (2, 4) and control.interval >= 0 and control.trusted >= 0
-    return count > 0 and shapes and _window(prepared, state.window, count) and _genealogy(state, count)
+    return count > 0 and shapes and _window(prepared, state.window, count) and _genealogy(state, count, prepared.model.n)
 
 
 def _within(index: Array, count: int) -> bool:
     return bool(index.size == 0 or (index.min() >= 0 and index.max() < count))
 
 
-def _genealogy(state: State, count: int) -> bool:
+def _genealogy(state: State, count: int, n: int) -> bool:
     genealogy = state.genealogy
     if not (0 <= genealogy.age and 0 <= genealogy.done and genealogy.first > 0):
+        return False
+    if genealogy.excess.shape != (DEPTH + 1, n, n):
         return False
     if genealogy.founders.shape != (count,) or not _within(genealogy.founders, genealogy.first):
         return False

@@ -13,6 +13,7 @@ import numpy as np
 
 from zakai.methods.particles.interval import Events, Motion, Observed
 from zakai.methods.particles.programs import Array
+from zakai.methods.particles.system import root
 from zakai.numerics.particles import moves
 from zakai.numerics.particles.chunks import CHUNK, over_chunks
 
@@ -190,6 +191,24 @@ def joined(parts: tuple[Events, ...]) -> Events:
     return Events(times, np.concatenate(places), given, np.concatenate(roots), np.concatenate(rows))
 
 
+class _Precision(NamedTuple):
+    """A matrix I + V' diag(values) V of as few orthonormal rows V (r, D) as observations inform."""
+
+    values: Array
+    vectors: Array
+
+    @classmethod
+    def of(cls, rows: list[Array]) -> _Precision:
+        """Return I + B'B for blocks of the rows of B."""
+        _, sizes, vectors = np.linalg.svd(np.concatenate(rows), full_matrices=False)
+        return cls(sizes**2, vectors)
+
+    def solve(self, right: Array) -> Array:
+        """Return the product of the inverse and a vector (D,) or columns (D, k)."""
+        share = self.values / (1.0 + self.values)
+        return np.asarray(right - (self.vectors.T * share) @ (self.vectors @ right))
+
+
 @dataclass(frozen=True)
 class Target:
     """The law of the noise of a window: N(0, I) times the likelihood of what is observed in it.
@@ -257,7 +276,7 @@ class Target:
         spread = _STEP * np.maximum(spread, 1e-9 * (1.0 + np.abs(centre)))
         moving = 0 if self.prior is not None else n
         gain: Array = np.zeros((D, n))
-        A = np.eye(D)
+        posterior = _Precision.of([np.zeros((0, D))])
         for _ in range(rounds):
             points = np.repeat(point[:, None], 1 + D + moving, axis=1)
             points[np.arange(D), 1 + np.arange(D)] += _STEP
@@ -269,7 +288,7 @@ class Target:
                 begin[np.arange(n), 1 + D + np.arange(n)] += spread
             ends = np.zeros((len(self.times), n, points.shape[1]))
             self.motion.advanced(self.events, np.ascontiguousarray(begin), np.ascontiguousarray(points), ends)
-            A, right, across = np.eye(D), np.zeros(D), np.zeros((D, moving))
+            rows, right, across = list[Array](), np.zeros(D), np.zeros((D, moving))
             before = begin
             for k, end in enumerate(ends):
                 x = end if self.motion.system.sampled else 0.5 * (before + end)
@@ -278,20 +297,22 @@ class Target:
                 scale = np.sqrt(np.sum(J**2, axis=1)) + spread / _STEP
                 slope, information = self._information(k, x[:, 0], scale)
                 factor = power if k == len(ends) - 1 else 1.0
-                inner = factor * information @ J
-                A += J.T @ inner
-                right += J.T @ (factor * slope + inner @ point)
+                seen = np.sqrt(factor) * root(information).T
+                inner = seen @ J
+                rows.append(inner)
+                right += J.T @ (factor * slope) + inner.T @ (inner @ point)
                 if moving:
-                    across += inner.T @ ((x[:, 1 + D :] - x[:, :1]) / spread)
-            if not (np.isfinite(A).all() and np.isfinite(right).all() and np.isfinite(across).all()):
+                    across += inner.T @ (seen @ ((x[:, 1 + D :] - x[:, :1]) / spread))
+            if not all(np.isfinite(part).all() for part in (*rows, right, across)):
                 return None
-            point = np.linalg.solve(A, right)
+            posterior = _Precision.of([np.zeros((0, D)), *rows])
+            point = posterior.solve(right)
         if moving:
-            gain = -np.linalg.solve(A, across)
-        values, vectors = np.linalg.eigh(A)
-        informed = values > 1.0 + _INFORMED
-        directions = np.ascontiguousarray(vectors[:, informed].T)
-        return point, np.ascontiguousarray(gain), centre, directions, np.sqrt(values[informed] / wider)
+            gain = -posterior.solve(across)
+        informed = posterior.values > _INFORMED
+        directions = np.ascontiguousarray(posterior.vectors[informed])
+        factors = np.sqrt((1.0 + posterior.values[informed]) / wider)
+        return point, np.ascontiguousarray(gain), centre, directions, factors
 
     def _information(self, k: int, x: Array, scale: Array) -> tuple[Array, Array]:
         """Return the slope (n,) and the information (n, n) of the log-likelihood of observation k at a state."""

@@ -121,7 +121,7 @@ def _transition(prepared: Prepared, k: int, piece: Element, before: Array, obser
         _, _, potential, _ = coefficients(prepared, piece, middle, inside, rates, before)  # type: ignore[arg-type]
         modes = known.weighted(potential[0]) if inside.any() else known.modes
         s = modes.scale[:, None]
-        result = s * (modes.modes @ (np.exp((first - last) * modes.rates)[:, None] * (modes.modes.T @ (result / s))))
+        result = s * modes.decayed(result / s, last - first)
     return np.asarray(result / piece.weights[:, None])
 
 

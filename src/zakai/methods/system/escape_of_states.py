@@ -16,7 +16,8 @@ from zakai.numerics.escape import share_that_escapes
 Array = Any
 RARE = 1e-2  # share of paths that may escape, which is ten times the default tolerance
 DIRECTIONS = 64
-CALM = 5.0, 2.5  # standard deviations of the prediction: where the drift is seen, and how far it may move a path
+CALM = 5.0, 2.5  # standard deviations of the prediction: where the drift is seen, and how far it may move a path from the mean's
+PATH_STEPS = 2  # Runge-Kutta steps of the mean's path in half of an interval
 SAMPLES = 256  # points of the density among which poles are sought
 FAR_OUT = 1e3  # standard deviations that show which states escape
 DOUBTFUL = "the density of the interval before is wrong, and guided-particles gives another one"
@@ -109,10 +110,7 @@ def _check_infinity(interval: Interval, mean: Array, cov: Array) -> None:
     directions = _directions(n, DIRECTIONS)
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     noise = np.nan_to_num(at(mean, start)[n:].reshape(n, n))
-    reach = _root(cov + noise * length)
-    values = at(mean + CALM[0] * directions @ reach.T, start + 0.5 * length)
-    moved = np.linalg.norm(values[:, :n] @ np.linalg.inv(reach).T, axis=1) * length
-    if np.max(moved) < CALM[1] and np.max(values[:, n:]) < 2.0 * np.max(noise) + 1e-300:
+    if _calm(interval, mean, _root(cov + noise * length), directions):
         return
 
     def coefficients(points: Array, times: Array) -> tuple[Array, Array]:
@@ -127,6 +125,33 @@ def _check_infinity(interval: Interval, mean: Array, cov: Array) -> None:
         names = [name for name, far in zip(model.state, apart, strict=True) if not far < FAR_OUT] or list(model.state)
         text = infinite_text(model, worst, ", ".join(names), share)
         raise interval.error(text if interval.row == 0 else f"{text}; or {DOUBTFUL}")
+
+
+def _calm(interval: Interval, mean: Array, reach: Array, directions: Array) -> bool:
+    """Return whether the drift hardly moves a far path away from that of the mean, and the noise out there is no larger."""
+    at, start, length, n = interval.at, interval.start, interval.length, len(mean)
+    path, times = _path_of_mean(interval, mean), start + length * np.array([0.0, 0.5, 1.0])
+    points = path[:, None] + CALM[0] * directions @ reach.T
+    far = at(points.reshape(-1, n), np.repeat(times, len(directions))).reshape(*points.shape[:2], -1)
+    near = at(path, times)
+    moved = np.linalg.norm((far[..., :n] - near[:, None, :n]) @ np.linalg.inv(reach).T, axis=2) * length
+    # A value that is not a number is not below a bound.
+    return bool(np.max(moved) < CALM[1] and np.max(far[..., n:]) < 2.0 * np.max(near[:, n:]) + 1e-300)
+
+
+def _path_of_mean(interval: Interval, mean: Array) -> Array:
+    """Return where the drift takes the mean at the start, the middle and the end of the interval (3, n)."""
+    at, n, path, x, t = interval.at, len(mean), [mean], mean, interval.start
+    step = interval.length / (2 * PATH_STEPS)
+    for i in range(2 * PATH_STEPS):
+        first = at(x, t)[:n]
+        second = at(x + 0.5 * step * first, t + 0.5 * step)[:n]
+        third = at(x + 0.5 * step * second, t + 0.5 * step)[:n]
+        x = x + step / 6.0 * (first + 2.0 * second + 2.0 * third + at(x + step * third, t + step)[:n])
+        t += step
+        if i % PATH_STEPS == PATH_STEPS - 1:
+            path.append(x)
+    return np.array(path)
 
 
 def _check_poles(interval: Interval, points: Array, divisors: Array) -> None:

@@ -58,6 +58,8 @@ def parts_needed(exact: Array, nodes: Array) -> Array:
     scale = np.maximum(np.abs(exact).max(axis=1), 1e-300)
     rest = np.abs(_TO_PROBES @ nodes - exact).max(axis=1) / scale
     excess = rest.max(axis=1) / RESOLVED
+    if (excess <= 1.0).all():
+        return np.ones(len(excess), int)
     more = np.ceil(1.1 * np.nan_to_num(excess) ** (1.0 / len(GAUSS_NODES)))
     return np.where(excess <= 1.0, 1, np.where(np.isfinite(excess), np.clip(more, 2, MOST_PARTS), 0)).astype(int)
 
@@ -122,6 +124,7 @@ def _averages() -> Array:
 
 
 AVERAGES = _averages()  # those of n parts begin at n (n - 1) / 2
+WHOLE = np.ones((1, 5, 1))  # of coefficients that do not depend on time
 
 
 @helper

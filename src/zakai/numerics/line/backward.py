@@ -17,7 +17,7 @@ from numba import boolean, float64, int64, types
 from numpy.typing import NDArray
 
 from zakai.numerics.compiled import helper, kernel
-from zakai.numerics.line.averages import AVERAGES, EARLY, LATE, MEAN, MOST_MAGNUS, averaged, averaging, operators
+from zakai.numerics.line.averages import AVERAGES, EARLY, LATE, MEAN, MOST_MAGNUS, WHOLE, averaged, averaging, operators
 from zakai.numerics.line.density import circular_moments, highest_of, moments, shifted, spectrum, support, waves
 from zakai.numerics.line.modes import decayed, propagate
 from zakai.numerics.line.resolution import ROUNDING as PRECISION
@@ -283,7 +283,6 @@ def by_modes(
 
 MOST_SUBSTEPS = 512
 EXCURSION = 3.9  # standard deviations of the noise that a path between two points goes beyond them, but for exp(-30)
-_WHOLE = np.ones((1, 5, 1))
 
 
 @helper
@@ -436,7 +435,7 @@ def by_adjoints(
     """
     count, size = len(steps.lengths), len(message.values)
     b, product, products, out = message.values.copy(), message.product.copy(), np.empty((count, size)), np.zeros((count, 6))
-    known = Constants(AVERAGES if steps.covariances.shape[1] > 1 else _WHOLE, *waves(size))
+    known = Constants(AVERAGES if steps.covariances.shape[1] > 1 else WHOLE, *waves(size))
     completed, first, last, start, error = _adjoint(
         message._replace(values=b, product=product), before, grid, steps, observed, limits, known, Results(products, out)
     )

@@ -14,13 +14,12 @@ from numpy.typing import NDArray
 
 from zakai.numerics.compiled import helper
 from zakai.numerics.line.density import highest_of
-from zakai.numerics.line.window import ALIGNMENT, SIZES, SMALL
+from zakai.numerics.line.window import ALIGNMENT, SIZES, SMALL, STENCIL_WEIGHTS
 
 Array = NDArray[Any]
 
 PER = 8  # points of rows in a spacing of the grid
-_STENCIL = 8
-_WEIGHTS = np.array([1.0 / np.prod([float(i - j) for j in range(8) if j != i]) for i in range(8)])
+_STENCIL = len(STENCIL_WEIGHTS)
 DEPTH = 36.0  # logarithm below the largest value from which cells are left out
 _TAIL = 32.0  # logarithm below the largest value at the ends of the range
 _CHANGE = 1.0  # of the likelihood in a cell, in standard deviations, up to which a cell is not divided
@@ -39,7 +38,7 @@ def weigh(at: float, size: int, stride: int, weights: Array) -> int:
             for l in range(_STENCIL):
                 weights[l] = 1.0 if l == k else 0.0
             return first * stride
-        weights[k] = _WEIGHTS[k] / distance
+        weights[k] = STENCIL_WEIGHTS[k] / distance
         total += weights[k]
     for k in range(_STENCIL):
         weights[k] /= total
@@ -306,14 +305,16 @@ def relative(x: float) -> float:
     return (1.0 - np.exp(-max(x, -5.0))) / max(x, -5.0) if abs(x) > 1e-8 else 1.0
 
 
-@helper
-def wanted(low: float, high: float, spacing: float, margin: float, answer: Array) -> None:
-    """Write the centre, the spacing and the size of a grid from `low` to `high` with a margin on both sides."""
-    apart = _APART * spacing
-    answer[0], answer[1], answer[2] = apart * np.floor(0.5 * (low + high) / apart + 0.5), spacing, np.inf
+def coarse_grid(low: float, high: float, spacing: float, margin: float) -> tuple[float, float, float]:
+    """Return the centre, the spacing and the size of a coarse grid from `low` to `high` with a margin on both sides."""
+    apart, size = _APART * spacing, np.inf
     for known in _SIZES[::-1]:
         if known >= (high - low + 2.0 * margin) / spacing + _APART + 2:
-            answer[2] = float(known)
+            size = float(known)
+    return apart * np.floor(0.5 * (low + high) / apart + 0.5), spacing, size
+
+
+wanted = helper(coarse_grid)
 
 
 @helper

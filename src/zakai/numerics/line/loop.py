@@ -19,7 +19,7 @@ from numba import float64, int64, types
 from numpy.typing import NDArray
 
 from zakai.numerics.compiled import kernel
-from zakai.numerics.line.averages import AVERAGES
+from zakai.numerics.line.averages import AVERAGES, WHOLE
 from zakai.numerics.line.density import circular_rows, highest_of, moments, separated, shifted, spectrum, support, waves
 from zakai.numerics.line.gaussian_kernels import BAND, convolved, kernel_of
 from zakai.numerics.line.product import WEAK_SHARE, weak_error, weaken
@@ -224,9 +224,6 @@ def declare_usual() -> None:
             _loop(kernels, splits, samples, False, closed)
 
 
-_WHOLE = np.ones((1, 5, 1))
-
-
 def advance(
     mechanisms: Mechanisms, state: Start, grid: Grid, steps: Steps, first: int, observed: Array, limits: Array
 ) -> Segment:
@@ -242,7 +239,7 @@ def advance(
     """
     count, size = len(observed), len(state.values)
     results = Results(np.empty((count, size)), np.empty((count + 1, len(COLUMNS))))
-    known = Constants(AVERAGES if steps.covariances.shape[1] > 1 else _WHOLE, *waves(size))
+    known = Constants(AVERAGES if steps.covariances.shape[1] > 1 else WHOLE, *waves(size))
     done, number = _loop(*mechanisms)(state, grid, steps, first, observed, limits, known, results)
     densities, out = results
     if mechanisms.closed:

@@ -48,6 +48,7 @@ from zakai.numerics.line.resolution import (
     ROUNDING,
     SPECTRUM_FACTOR,
     SPECTRUM_SHARE,
+    TRIALS,
     step_error,
 )
 from zakai.numerics.line.steps import (
@@ -71,7 +72,7 @@ _V, _M, _T = float64[::1], float64[:, ::1], float64[:, :, ::1]
 LOG_NOISE = -33.4  # logarithm of the error of a decomposition relative to the maximum
 _NEGLIGIBLE = 42.0  # -log of the factor of a mode that is negligible
 _SPREAD = 0.01  # of the value at an abrupt end that the interpolant spreads to the middle of the grid
-_FALL = 4.2  # half of the range of erfc(y) / 2 from one to zero
+FALL = 4.2  # half of the range of erfc(y) / 2 from one to zero
 
 
 @helper
@@ -193,7 +194,7 @@ def carried(
         unsure /= total
         gathered(inner, at, coefficients)
         for j in range(first):  # the waves that R' leaves everywhere; where they end abruptly, the derivatives spread that
-            fall = 0.5 * erfc(_FALL * (2.0 * (first - j) / first - 1.0))
+            fall = 0.5 * erfc(FALL * (2.0 * (first - j) / first - 1.0))
             coefficients[j] *= fall
             coefficients[size - 1 - j] *= fall
     decay = decayed(rates, tau)
@@ -282,7 +283,6 @@ class Results(NamedTuple):
 
 
 STAY, OWN, PLACE = range(3)  # steps on the grid of the density; on its own grid the first transition, or none
-TRIALS = 6  # coarse grids on which a step is tried
 
 
 @kernel(
@@ -341,7 +341,7 @@ def advance(
         # The transition.
         for trial in range(TRIALS):
             if not alone:
-                wanted(left, right, coarse, margin, answer)
+                answer[0], answer[1], answer[2] = wanted(left, right, coarse, margin)
             if not stays or i == 0:
                 place = place_of(index, answer)
             if place < 0:

@@ -15,19 +15,12 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from numba import complex128, float64
 from numpy.typing import NDArray
 
-from zakai.numerics.compiled import kernel
-from zakai.numerics.complex_step import is_complex, real_product
+from zakai.numerics.complex_step import real_product
 from zakai.numerics.line.resolution import ROUNDING
 
 Array = NDArray[Any]
-
-TERMS = 40
-PART = 3.0  # norm up to which one Taylor series is summed
-DENSE = 130.0  # norm times this, above size^2, from which the exponential is computed as a matrix
-
 
 @lru_cache(maxsize=64)
 def derivatives(size: int, closed: bool) -> tuple[Array, Array]:
@@ -68,70 +61,32 @@ def generator(closed: bool, spacing: float, covariance: Any, drift: Array, poten
     return np.asarray(matrix)
 
 
-@kernel(
-    float64[::1](float64[:, ::1], float64[::1], float64, float64),
-    complex128[::1](complex128[:, ::1], complex128[::1], float64, float64),
-)
-def _taylor(matrix: Array, vector: Array, shift: float, norm: float) -> Array:
-    """exp(matrix + shift) vector, by Taylor series in equal parts; `norm` bounds that of the matrix."""
-    parts = max(1, int(np.ceil(norm / PART)))
-    total = vector.copy()
-    size = total.shape[0]
-    factor = np.exp(shift / parts)
-    for _ in range(parts):
-        term = total.copy()
-        largest = 0.0
-        for i in range(size):
-            largest = max(largest, abs(total[i].real))
-        for k in range(1, TERMS):
-            term = np.dot(matrix, term)
-            scale = 1.0 / (parts * k)
-            change = 0.0
-            for i in range(size):
-                term[i] *= scale
-                total[i] += term[i]
-                change = max(change, abs(term[i].real))
-            if change < 1e-17 * largest:
-                break
-        for i in range(size):
-            total[i] *= factor
-    return total
-
-
 class Exponential:
-    """exp(A) for A (N, N), real, or complex with an infinitesimal imaginary part: it multiplies any number of vectors.
+    """exp(A) for A (N, N), real, or complex with an infinitesimal imaginary part, by scaling and squaring.
 
-    Of a matrix with a large norm the exponential is computed once, by scaling and squaring; of another one only its products
-    with vectors are.
+    It multiplies any number of vectors.
     """
 
     def __init__(self, matrix: Array):
         size = len(matrix)
-        self.shift = float(np.trace(matrix.real)) / size
-        self.matrix = np.ascontiguousarray(matrix - self.shift * np.eye(size))
-        self.norm = float(np.abs(self.matrix.real).sum(axis=0).max())  # as an operator on probabilities
-        self.dense = np.isfinite(self.norm) and self.norm * DENSE > size**2
-        if self.dense:
-            squarings = int(np.ceil(np.log2(self.norm))) + 1
+        shift = float(np.trace(matrix.real)) / size
+        matrix = matrix - shift * np.eye(size)
+        norm = float(np.abs(matrix.real).sum(axis=0).max())  # as an operator on probabilities
+        self.finite = bool(np.isfinite(norm))
+        if self.finite:
+            squarings = int(np.ceil(np.log2(max(norm, 0.5)))) + 1
             self.powers = min(squarings, 4)
             self.error = 1e-16 * 2.0**squarings
-            self.matrix = exponential(self.matrix * 0.5**squarings) * np.exp(self.shift * 0.5**squarings)
+            self.matrix = exponential(matrix * 0.5**squarings) * np.exp(shift * 0.5**squarings)
             for _ in range(squarings - self.powers):
                 self.matrix = self.matrix @ self.matrix
 
     def __call__(self, vector: Array) -> tuple[Array, float]:
         """Return exp(A) vector, and an estimate of its relative rounding error."""
-        matrix = self.matrix
-        if not np.isfinite(self.norm):
+        if not self.finite:
             return np.full_like(vector, np.nan), np.inf
-        if not is_complex(matrix) and is_complex(vector):
-            (real, error), (imaginary, _) = self(vector.real), self(vector.imag)
-            return real + 1j * imaginary, error
-        if not self.dense:
-            vector = np.ascontiguousarray(vector, matrix.dtype)
-            return _taylor(matrix, vector, self.shift, self.norm), 1e-16 * (1.0 + self.norm)
         for _ in range(2**self.powers):
-            vector = matrix @ vector
+            vector = real_product(self.matrix, vector)
         return vector, self.error
 
 
@@ -223,10 +178,10 @@ class Spectral:
         return result, ROUNDING * reach * growth / top if top > 0 else np.inf
 
     def decayed(self, inner: Array, length: float) -> Array:
-        """Return U exp(-length lambda) U' inner."""
+        """Return U exp(-length lambda) U' inner, for one vector (N,) or, where H is real, several (N, J)."""
         decay = np.exp(-length * self.rates)
         coefficients = real_product(self.modes.T, inner)
-        propagated = decay * coefficients
+        propagated = (decay * coefficients.T).T
         if self.change is not None:
             propagated = propagated + 1j * ((quotients(self.rates, decay, length) * self.change) @ coefficients.real)
         return real_product(self.modes, propagated)

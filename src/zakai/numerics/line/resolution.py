@@ -22,6 +22,7 @@ TRANSITION_SHARE = 0.1  # of the tolerance that a transition of its own kind may
 SMOOTHER_SHARE = 0.01  # of the error that an interval of a smoother may make: what modes and rounding may leave
 SUPPORT = 8.0  # standard deviations to the end of a density
 LOST_MASS = 1e-3  # of a transition, beyond which it fails
+TRIALS = 8  # grids that are tried for one step or one message
 
 
 def spectrum_bound(negligible: float, tolerance: float) -> float:

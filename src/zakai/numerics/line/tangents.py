@@ -18,11 +18,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from numba import float64, void
 from numpy.typing import NDArray
-from scipy.special import ndtr
+from scipy.special import erfc
 
 from zakai.numerics.compiled import kernel
 from zakai.numerics.complex_step import STEP
-from zakai.numerics.line.operator import DENSE, PART, TERMS, FourierOperator, Spectral, derivatives, exponential_of, quotients
+from zakai.numerics.line.modes import FALL
+from zakai.numerics.line.operator import FourierOperator, Spectral, derivatives, exponential_of, quotients
 from zakai.numerics.line.resolution import ROUNDING
 from zakai.numerics.line.window import CUT, SMALL, Window, density_at, gathered, interpolated, local_polynomial
 
@@ -30,7 +31,9 @@ Array = NDArray[Any]
 
 Coefficients = tuple[Any, Array, Array | None]  # G, one number or (N,), f (N,) and V (N,), or integrals over time of these
 
-LONG = 8.0  # series of an operator with so large a norm take longer than its exponential by complex steps
+TERMS = 40
+PART = 3.0  # norm up to which one Taylor series is summed
+LONG = 0.06  # norm over size^2 from which series take longer than an exponential by complex steps
 
 _M = float64[:, ::1]
 
@@ -56,7 +59,7 @@ def exponential_tangents(
     if not np.isfinite(norm):
         return np.full_like(values, np.nan), np.full_like(tangents, np.nan)
     scales = 0.5 / unit**2, 1.0 / unit, 1.0
-    if norm * DENSE > LONG * size**2:
+    if norm > LONG * size**2:
         return _by_complex_steps(window, changed, values, tangents)
     rows = np.zeros((3, 1 + len(changed), size))  # of G, f and V: the values, and their derivatives
     for row, scale, *parts in zip(rows, scales, coefficients, *changed, strict=True):
@@ -209,8 +212,7 @@ def _faded(size: int, margins: tuple[int, int]) -> Array:
     """Return factors (N,) that fall to zero at the two ends of a grid."""
     result = np.ones(size)
     for margin, end in zip(margins, (result, result[::-1]), strict=True):
-        end[:margin] = ndtr(_FALL * np.linspace(-1.0, 1.0, margin, endpoint=False))
+        end[:margin] = 0.5 * erfc(FALL * np.linspace(1.0, -1.0, margin, endpoint=False))
     return result
 
 
-_FALL = 6.0  # standard deviations from the middle to the ends of a factor that falls

@@ -22,7 +22,7 @@ from zakai.numerics.line.resolution import NEGLIGIBLE, SPECTRUM_FACTOR
 Array = NDArray[Any]
 
 _STENCIL = np.arange(-3, 5)
-_WEIGHTS = np.array([1.0 / np.prod([float(i - j) for j in _STENCIL if j != i]) for i in _STENCIL])
+STENCIL_WEIGHTS = np.array([1.0 / np.prod([float(i - j) for j in _STENCIL if j != i]) for i in _STENCIL])
 
 
 def local_polynomial(values: Array, window: Window, offsets: Array) -> Array:
@@ -51,7 +51,7 @@ def _nearest(values: Array, window: Window, at: Array) -> tuple[Array, Array]:
         near = np.clip(near, -_STENCIL[0], window.size - 1 - _STENCIL[-1])
     distance = (at - near)[:, None] - _STENCIL
     exact = np.abs(distance) < 1e-12
-    weights = np.where(exact.any(axis=1, keepdims=True), exact, _WEIGHTS / np.where(exact, 1.0, distance))
+    weights = np.where(exact.any(axis=1, keepdims=True), exact, STENCIL_WEIGHTS / np.where(exact, 1.0, distance))
     own = values[..., (near[:, None].astype(int) + _STENCIL) % window.size]
     return weights / np.sum(weights, axis=1, keepdims=True), own
 

@@ -44,20 +44,20 @@ def draw_before(train: Any, closed: Array, deviations: Array, y: Array, share: A
         most: the largest number of nodes.
         out: receives the draws (n, P), their means given y (n, P), and one, zero where the density is not positive (P,).
     """
-    low, step, sizes, ranks, padded, offsets, flat = train[2], train[3], train[4], train[6], train[7], train[8], train[9]
+    low, step, sizes, ranks, offsets, flat = train[2], train[3], train[4], train[6], train[7], train[8]
     n, count = low.size, y.shape[1]
-    width, longest = 4, 1
+    width, longest = 1, 1
     for k in range(n):
-        width, longest = max(width, padded[k], ranks[k + 1]), max(longest, sizes[k] + 2 * PAD)
+        width, longest = max(width, ranks[k + 1]), max(longest, sizes[k] + 2 * PAD)
     weights, rows = np.empty((n, most)), np.empty((n, most, width))
     origin, spacing, nodes = np.empty(n), np.empty(n), np.empty(n, np.int64)
     carried, right, before = np.empty((longest, width)), np.empty(width), np.empty(width)
     v, left = np.empty(width), np.empty(width)
-    w, c, summed, ends = np.empty(6), np.empty(6 * width), np.empty((n, longest)), np.empty((n, 2), np.int64)
+    w, summed, ends = np.empty(6), np.empty((n, longest)), np.empty((n, 2), np.int64)
     for p in range(count):
         right[0], exists = 1.0, True
         for k in range(n - 1, -1, -1):
-            a, b, wide, long = ranks[k], ranks[k + 1], padded[k], sizes[k] + 2 * PAD
+            a, b, long = ranks[k], ranks[k + 1], sizes[k] + 2 * PAD
             deviation = deviations[k]
             first, last = low[k] - 2.9 * step[k], low[k] + (sizes[k] + 1.9) * step[k]
             if closed[k]:
@@ -78,17 +78,14 @@ def draw_before(train: Any, closed: Array, deviations: Array, y: Array, share: A
                 highest = min(int(math.floor((origin[k] + (nodes[k] - 1) * spacing[k] - low[k]) / step[k])) + 3 + PAD, long - 1)
             for j in range(lowest, highest + 1):
                 summed[k, j] = 0.0
-                for i in range(wide):
-                    carried[j, i] = 0.0
+                for i in range(a):
+                    base, t = offsets[k] + (j * a + i) * b, 0.0
+                    for q in range(b):
+                        t += right[q] * flat[base + q]
+                    carried[j, i] = t
             ends[k, 0], ends[k, 1] = lowest, highest
-            for q in range(b):
-                base, factor = offsets[k] + q * long * wide, right[q]
-                for j in range(lowest, highest + 1):
-                    row = flat[base + j * wide : base + (j + 1) * wide]
-                    for i in range(wide):
-                        carried[j, i] += factor * row[i]
             top = 0.0
-            for i in range(wide):
+            for i in range(a):
                 before[i] = 0.0
             for node in range(nodes[k]):
                 z = origin[k] + node * spacing[k]
@@ -96,7 +93,7 @@ def draw_before(train: Any, closed: Array, deviations: Array, y: Array, share: A
                 if closed[k]:
                     s -= sizes[k] * math.floor(s / sizes[k])
                 row = rows[k, node]
-                for i in range(wide):
+                for i in range(a):
                     row[i] = 0.0
                 weights[k, node] = 0.0
                 if not closed[k] and (s <= -2.9 or s >= sizes[k] + 1.9):
@@ -109,9 +106,9 @@ def draw_before(train: Any, closed: Array, deviations: Array, y: Array, share: A
                 for d in range(6):
                     tap, one = g * w[d], carried[j - 2 + PAD + d]
                     summed[k, j - 2 + PAD + d] += tap
-                    for i in range(wide):
+                    for i in range(a):
                         row[i] += tap * one[i]
-                for i in range(wide):
+                for i in range(a):
                     before[i] += row[i]
             for i in range(a):
                 right[i] = before[i]
@@ -126,7 +123,7 @@ def draw_before(train: Any, closed: Array, deviations: Array, y: Array, share: A
             continue
         v[0] = left[0] = out[2 * n, p] = 1.0
         for k in range(n):
-            a, b, wide, long = ranks[k], ranks[k + 1], padded[k], sizes[k] + 2 * PAD
+            a, b = ranks[k], ranks[k + 1]
             total = mass = moment = 0.0
             for node in range(nodes[k]):
                 t = u = 0.0
@@ -151,30 +148,26 @@ def draw_before(train: Any, closed: Array, deviations: Array, y: Array, share: A
                 s -= sizes[k] * math.floor(s / sizes[k])
             j, top = int(math.floor(s)), 0.0
             taps(s - j, w)
+            right[:b] = 0.0
             for d in range(6):
-                for i in range(wide):
-                    c[d * wide + i] = w[d] * v[i] if i < a else 0.0
+                for i in range(a):
+                    base, factor = offsets[k] + ((j - 2 + PAD + d) * a + i) * b, w[d] * v[i]
+                    for q in range(b):
+                        right[q] += factor * flat[base + q]
             for q in range(b):
-                base = offsets[k] + (q * long + j - 2 + PAD) * wide
-                row, t = flat[base : base + 6 * wide], 0.0
-                for i in range(6 * wide):
-                    t += c[i] * row[i]
-                right[q] = t
-                top = max(top, abs(t))
+                top = max(top, abs(right[q]))
             for q in range(b):
                 v[q] = right[q] / (top + 1e-300)
             top = 0.0
+            right[:b] = 0.0
+            for j in range(ends[k, 0], ends[k, 1] + 1):
+                if summed[k, j] != 0.0:
+                    for i in range(a):
+                        base, factor = offsets[k] + (j * a + i) * b, summed[k, j] * left[i]
+                        for q in range(b):
+                            right[q] += factor * flat[base + q]
             for q in range(b):
-                t = 0.0
-                for j in range(ends[k, 0], ends[k, 1] + 1):
-                    row = flat[offsets[k] + (q * long + j) * wide : offsets[k] + (q * long + j + 1) * wide]
-                    if summed[k, j] != 0.0:
-                        u = 0.0
-                        for i in range(a):
-                            u += left[i] * row[i]
-                        t += summed[k, j] * u
-                right[q] = t
-                top = max(top, abs(t))
+                top = max(top, abs(right[q]))
             for q in range(b):
                 left[q] = right[q] / (top + 1e-300)
 

@@ -22,16 +22,17 @@ from zakai.numerics.trains.grid import PAD, taps
 Array = Any
 # Times at both ends of each step (E, 2), and the given numbers there (E, 2, L).
 PATH = types.Tuple((F2, F3))
-# Centre, inverse of the basis, low, step, sizes; periods (0 or 2 pi); ranks (n + 1,), their padded values, offsets, coefficients;
-# of the Gaussian that stands for the tails the mean less the centre, the inverse of a root of the covariance, and [square of the
-# radius where it begins, largest value].
-TRAIN = types.Tuple((F1, F2, F1, F1, I1, F1, I1, I1, I1, F1, F1, F2, F1))
+# Centre, inverse of the basis, low, step, sizes; periods (0 or 2 pi); ranks (n + 1,), offsets, coefficients (N + 2 PAD, a, b) of
+# each core; of the Gaussian that stands for the tails the mean less the centre, the inverse of a root of the covariance, and
+# [square of the radius where it begins, largest value].
+TRAIN = types.Tuple((F1, F2, F1, F1, I1, F1, I1, I1, F1, F1, F2, F1))
 # Ranks (n + 1,), sizes (n,), where each core begins (n,), and the cores in the order (N, a, b).
 PACKED = types.Tuple((I1, I1, I1, F1))
 # A train, [factor, logarithm of what it is divided by], the motion, the domain, and the path to it.
 TERM = types.Tuple((TRAIN, F1, PROGRAM, BOX, PATH))
 # The law, its given numbers, which terms count, and [time, power, top]; no term counts: no likelihood.
 LAW = types.Tuple((PROGRAM, F1, F1, F1))
+POINTS, TOGETHER = 1024, 64  # of a block, which are sorted, and of one product of matrices
 LARGEST_LOG = 500.0  # of a factor; the exponential of more is cut
 # Later observations lead into what are tails now, where an error relative to the density becomes one of the mean.  With the power
 # 1/2 of the sums (the scaling of correspondence analysis) the error of a skeleton is relative to the density, as an average over
@@ -84,56 +85,76 @@ def add_train(train: Any, x: Array, moved: bool, scale: Array, out: Array) -> No
     """Add the values of a train at points x (n, P) to `out` (P,).
 
     v <- sum_d w_d(z_k) v C_k[j + d] over the axes, times scale[0] and, if moved, exp(x[n] - scale[1]); a value that is not a
-    number counts as zero.
+    number counts as zero.  Points of a block are sorted by their cell j on each axis: those of a cell are a product of matrices.
     """
-    centre, inverse, low, step, sizes, periods, ranks, padded, offsets, flat, mean, whitening, tail = train
+    centre, inverse, low, step, sizes, periods, ranks, offsets, flat, mean, whitening, tail = train
     n, count = low.size, x.shape[1]
-    width = 0
-    for k in range(n + 1):
-        width = max(width, ranks[k] + 4)
-    w, v, c, y, s = np.empty(6), np.empty(width), np.zeros(6 * width), np.empty(n), np.empty(n)
-    for p in range(count):
-        for d in range(n):
-            y[d] = x[d, p] - centre[d]
-            if periods[d] > 0.0:
-                y[d] -= periods[d] * math.floor(y[d] / periods[d] + 0.5)
-        inside, square = True, 0.0
-        for k in range(n):
-            z, white = 0.0, 0.0
+    width, cells = 0, 0
+    for k in range(n):
+        width, cells = max(width, ranks[k + 1]), max(cells, sizes[k] + 2 * PAD)
+    w, c, y, s = np.empty(6), np.empty(TOGETHER * 6 * width), np.empty(n), np.empty((n, POINTS))
+    v, after = np.empty((POINTS, width)), np.empty(TOGETHER * width)
+    inside, alive, cell = np.empty(POINTS, np.bool_), np.empty(POINTS, np.int64), np.empty(POINTS, np.int64)
+    starts, order = np.empty(cells + 1, np.int64), np.empty(POINTS, np.int64)
+    for first in range(0, count, POINTS):
+        size, used = min(POINTS, count - first), 0
+        for p in range(size):
             for d in range(n):
-                z += inverse[k, d] * y[d]
-                white += whitening[k, d] * (y[d] - mean[d])
-            s[k] = (z - low[k]) / step[k]
-            inside = inside and s[k] > -2.9 and s[k] < sizes[k] + 1.9
-            square += white * white
-        if square > tail[0]:
-            v[0] = tail[1] * math.exp(-0.5 * square)
-        elif not inside:
-            continue
-        else:
-            v[0] = 1.0
-        for k in range(n if square <= tail[0] else 0):
-            j = int(math.floor(s[k]))
-            taps(s[k] - j, w)
-            a, wide = ranks[k], padded[k]
-            for d in range(6):
-                for i in range(a):
-                    c[d * wide + i] = w[d] * v[i]
-                for i in range(a, wide):
-                    c[d * wide + i] = 0.0
-            stride = (sizes[k] + 2 * PAD) * wide
-            base = offsets[k] + (j - 2 + PAD) * wide
-            for q in range(ranks[k + 1]):
-                row = flat[base + q * stride : base + q * stride + 6 * wide]
-                t = 0.0
-                for r in range(6 * wide):
-                    t += c[r] * row[r]
-                v[q] = t
-        value = scale[0] * v[0]
-        if moved:
-            value *= math.exp(min(x[n, p] - scale[1], LARGEST_LOG))
-        if value == value:
-            out[p] += value
+                y[d] = x[d, first + p] - centre[d]
+                if periods[d] > 0.0:
+                    y[d] -= periods[d] * math.floor(y[d] / periods[d] + 0.5)
+            within, square = True, 0.0
+            for k in range(n):
+                z, white = 0.0, 0.0
+                for d in range(n):
+                    z += inverse[k, d] * y[d]
+                    white += whitening[k, d] * (y[d] - mean[d])
+                s[k, p] = (z - low[k]) / step[k]
+                within = within and s[k, p] > -2.9 and s[k, p] < sizes[k] + 1.9
+                square += white * white
+            inside[p] = within or square > tail[0]
+            v[p, 0] = 1.0
+            if square > tail[0]:
+                v[p, 0] = tail[1] * math.exp(-0.5 * square)
+            elif within:
+                alive[used] = p
+                used += 1
+        for k in range(n):
+            a, b = ranks[k], ranks[k + 1]
+            starts[: sizes[k] + 2 * PAD + 1] = 0
+            for i in range(used):
+                cell[alive[i]] = int(math.floor(s[k, alive[i]])) - 2 + PAD
+                starts[cell[alive[i]] + 1] += 1
+            for j in range(sizes[k] + 2 * PAD):
+                starts[j + 1] += starts[j]
+            for i in range(used):
+                p = alive[i]
+                order[starts[cell[p]]] = p
+                starts[cell[p]] += 1
+            begin = 0
+            while begin < used:
+                j, end = cell[order[begin]], begin
+                while end < used and end < begin + TOGETHER and cell[order[end]] == j:
+                    p, row = order[end], c[(end - begin) * 6 * a : (end - begin + 1) * 6 * a]
+                    taps(s[k, p] - math.floor(s[k, p]), w)
+                    for d in range(6):
+                        for q in range(a):
+                            row[d * a + q] = w[d] * v[p, q]
+                    end += 1
+                base, group = offsets[k] + j * a * b, end - begin
+                matrix = flat[base : base + 6 * a * b].reshape(6 * a, b)
+                np.dot(c[: group * 6 * a].reshape(group, 6 * a), matrix, after[: group * b].reshape(group, b))
+                for i in range(group):
+                    for q in range(b):
+                        v[order[begin + i], q] = after[i * b + q]
+                begin = end
+        for p in range(size):
+            if inside[p]:
+                value = scale[0] * v[p, 0]
+                if moved:
+                    value *= math.exp(min(x[n, first + p] - scale[1], LARGEST_LOG))
+                if value == value:
+                    out[first + p] += value
 
 
 @helper

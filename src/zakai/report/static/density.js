@@ -29,6 +29,7 @@ import { firstAtLeast, moment, text, unpack } from "./axes.js";
 import { Panel, drawSeries } from "./panel.js";
 
 const TURN = 2 * Math.PI;
+const REACH = 3; // of the median distance of columns: how far one is drawn from its time, at most
 const FLAT = 0.3; // shade of a band without a density
 const STYLES = {
   band: (c) => ({ colour: c.band, width: 0.9 }),
@@ -176,6 +177,8 @@ function prepared(frame) {
   for (let k = 1; k < count; k++) borders[k] = (times[k - 1] + times[k]) / 2;
   borders[0] = count > 1 ? times[0] - (borders[1] - times[0]) : times[0] - 0.5;
   borders[count] = count > 1 ? times[count - 1] + (times[count - 1] - borders[count - 1]) : times[0] + 0.5;
+  const distances = Float64Array.from({ length: count - 1 }, (_, k) => times[k + 1] - times[k]).sort();
+  frame.reach = count > 1 ? REACH * distances[(count - 1) >> 1] : Infinity;
   if (!cells) return frame;
   const rows = (frame.rows = shapes.cells[1]), sums = (frame.sums = new Float32Array(count * (rows + 1)));
   for (let k = 0; k < count; k++) {
@@ -226,7 +229,10 @@ function shade(pixels, across, down, view, frame, table) {
     if (middle < Math.min(begin, borders[0]) || middle > Math.max(end, borders[borders.length - 1])) continue;
     // The columns whose times are in this pixel, or the one that is nearest.
     let first = firstAtLeast(times, left), last = firstAtLeast(times, left + width) - 1;
-    if (last < first) first = last = columnAt(frame, middle);
+    if (last < first) {
+      first = last = columnAt(frame, middle);
+      if (Math.abs(times[first] - middle) > frame.reach) continue; // in a gap of the record no density is known
+    }
     if (first !== drawn[0] || last !== drawn[1]) {
       shades.fill(0);
       for (let k = first; k <= last; k++) addColumn(shades, down, view.y, frame, k);

@@ -18,11 +18,14 @@ import { Takeaway } from "./takeaway.js";
 import { TwoStates } from "./joint.js";
 import { Algebra } from "./algebra.js";
 
+const SHORT = 700; // milliseconds after which a computation can be cancelled
+const OUTDATED = 1000; // milliseconds after which a run ends when another one is wanted
 const TYPING = 220, RESTING = 600; // milliseconds without a key before the model is read, and before methods are looked for
 
 class Studio {
   constructor() {
     this.link = new Link();
+    this.works = 0; // computations beside a run that take long
     this.state = { text: "", data: null, method: "auto", options: {}, coordinate: null, tab: "parameters" };
     this.model = null; // what the text holds, null while it has an error
     this.summary = null; // of the main result
@@ -51,8 +54,12 @@ class Studio {
     return { text, data, method, options };
   }
 
-  /** Ask the studio; what a newer request has replaced ends silently, an error is said in the line of status unless `quiet`. */
+  /**
+   * Ask the studio; what a newer request has replaced ends silently, an error is said in the line of status unless `quiet`.
+   * `work`: this may take long; it can then be cancelled.
+   */
   async ask(what, request = {}, more = {}) {
+    const end = more.work ? this._working() : null;
     try {
       return await this.link.ask(what, request, more);
     } catch (error) {
@@ -60,7 +67,22 @@ class Studio {
       if (more.quiet) throw error;
       this.say(error.cancelled ? "Cancelled." : error.message, !error.cancelled);
       return null;
+    } finally {
+      end?.();
     }
+  }
+
+  /** A request that may take long has begun: it can be cancelled once it does; what is returned is called at its end. */
+  _working() {
+    let shown = 0;
+    const show = (by) => { shown += by; this.works += by; this._bar(); };
+    const timer = setTimeout(() => show(1), SHORT);
+    return () => { clearTimeout(timer); if (shown) show(-1); };
+  }
+
+  _bar() {
+    byId("cancel").hidden = byId("progress").hidden = !this.running && !this.works;
+    this.progressed(0, null);
   }
 
   say(text, wrong = false) {
@@ -70,9 +92,8 @@ class Studio {
   }
 
   async _begin(hello) {
+    const first = !this.hello;
     this.hello = hello;
-    const first = this.begun !== true;
-    this.begun = true;
     if (!first) { this.say("Connected again."); await this._read(); await this.run(); return; }
     const stored = await decoded(location.hash);
     const given = hello.model ? { text: hello.model, data: this.data.simulated(hello.model) } : EXAMPLE;
@@ -168,11 +189,13 @@ class Studio {
 
   /** Filter the record with the method that is chosen. */
   async run() {
-    if (this.running) { this.again = true; return; }
+    if (this.running) { this._next(); return; }
     if (!this.model) return;
     if (!this.model.prior) { this.say("The model has no prior: add a table [prior] to filter; it can be analysed without.", true); return; }
     this.busy(true, "Filtering …");
+    this.begun = { at: performance.now(), asked: JSON.stringify(this.request) };
     const found = await this.ask("run", { ...this.request, name: "main" }, { progress: (done, total) => this.progressed(done, total) });
+    this.begun = null;
     this.busy(false);
     if (!found) return;
     this.summary = found;
@@ -183,12 +206,18 @@ class Studio {
     this.method.look();
   }
 
+  /** Something else is to be filtered: what runs ends where it takes long, unless results are kept, which its process holds. */
+  _next() {
+    if (this.begun?.asked === JSON.stringify(this.request)) return;
+    this.again = true;
+    if (this.begun && performance.now() - this.begun.at > OUTDATED && !this.tabs.get("compare").kept.length) this.link.tell("cancel");
+  }
+
   busy(on, said = "") {
     this.running = on;
     byId("run").disabled = on || !this.model;
-    byId("cancel").hidden = byId("progress").hidden = !on;
+    this._bar();
     document.body.classList.toggle("busy", on);
-    this.progressed(0, null);
     if (on) this.say(said);
     if (!on && this.again) { this.again = false; setTimeout(() => this.run()); } // what was wanted meanwhile
     clearTimeout(this.patience);

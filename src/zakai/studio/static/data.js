@@ -91,11 +91,11 @@ export class Data {
     } catch (error) { this.wrong(error.message); }
   }
 
-  wrong(message) {
+  wrong(message, said = "has an error") {
     this.fault.textContent = message;
     this.fault.hidden = false;
     this.facts.textContent = "";
-    byId("data-said").textContent = "has an error";
+    byId("data-said").textContent = said;
     byId("data-said").classList.add("fault");
   }
 
@@ -115,17 +115,14 @@ export class Data {
   _mapping() {
     const { found } = this, { model, state: { data } } = this.studio;
     if (!found || !model || data.kind !== "file") return;
-    const names = found.columns.slice(1), matched = model.observations.every((name) => names.includes(name));
-    const free = names.filter((name) => !model.inputs.includes(name));
-    const columns = data.columns?.length === model.observations.length ? data.columns : model.observations.map((name, j) => (matched ? name : free[j] ?? names[0]));
-    const inputs = data.inputs?.length === model.inputs.length ? data.inputs : model.inputs.map((name) => (names.includes(name) ? name : names[names.length - 1]));
+    const names = found.columns.slice(1), [columns, inputs] = matched(names, data, model);
     this.studio.state.data = { ...data, columns, inputs };
     const choose = (what, chosen, key, j) => field(what, h("select", { "data-testid": `column-${what.split(" ").pop()}`, onchange: ({ target }) => {
       const list = [...this.studio.state.data[key]];
       list[j] = target.value;
       this.studio.state.data = { ...this.studio.state.data, [key]: list };
       this.changed();
-    } }, names.map((name) => h("option", { value: name, selected: name === chosen }, name))));
+    } }, chosen ? null : h("option", { value: "", selected: true }, "choose …"), names.map((name) => h("option", { value: name, selected: name === chosen }, name))));
     const truth = [h("label", { class: "drop small", for: "truth-file" }, data.truth ? h("strong", {}, data.truth.name) : "True states, where they are known", h("small", {}, `a CSV with time, ${model.state.join(", ")}`)),
       h("input", { type: "file", accept: ".csv,.txt,.tsv,text/csv", class: "file", id: "truth-file", "data-testid": "truth-file", onchange: ({ target }) => target.files[0] && this._truth(target.files[0]) })];
     const unit = field("Unit of time", h("select", { onchange: ({ target }) => { this.studio.state.data = { ...this.studio.state.data, unit: target.value || undefined }; this.changed(); } },
@@ -154,6 +151,10 @@ export class Data {
   async _describe() {
     const { studio } = this, { text, data } = studio.state;
     if (!studio.model || (data.kind === "file" && !data.file)) return false;
+    if (data.kind === "file" && data.columns && data.inputs) {
+      const open = [...studio.model.observations, ...studio.model.inputs].filter((_, k) => ![...data.columns, ...data.inputs][k]);
+      if (open.length) { this.wrong(`Choose the column of ${open.join(", ")}.`, "columns to choose"); return false; }
+    }
     let found;
     try {
       found = await studio.ask("describe", { text, data }, { quiet: true });
@@ -166,8 +167,8 @@ export class Data {
     const unit = found.unit ? ` ${found.unit}` : "";
     this.facts.textContent = [
       `${counted(found.rows, "row")}, times ${number(found.first, 6)} to ${number(found.last, 6)}${unit}`,
-      found.irregular ? `irregular: every ${number(found.step, 3)}${unit} at the median, longest gap ${number(found.longest, 3)}${unit}` : found.step ? `one every ${number(found.step, 3)}${unit}` : "",
-      missing.length ? `not observed: ${missing.map(([name, count]) => `${name} in ${counted(count, "row")}`).join(", ")}` : "no gaps",
+      found.irregular ? `irregular: one every ${number(found.step, 3)}${unit} at the median, the longest interval is ${number(found.longest, 3)}${unit}, after ${number(found.longest_from, 6)}` : found.step ? `one every ${number(found.step, 3)}${unit}` : "",
+      missing.length ? `missing: ${missing.map(([name, count]) => `${name} in ${counted(count, "row")}`).join(", ")}` : "no missing values",
       found.origin ? `t = 0 at ${found.origin.replace("T", " ")}` : "",
     ].filter(Boolean).join(" · ");
     this._sketch(found);
@@ -182,4 +183,17 @@ export class Data {
     const series = names.slice(0, 4).map((name, j) => ({ role: `y${j}`, text: name, x: times, y: Float32Array.from({ length: times.length }, (_, k) => values[k * m + j]), dots: true, colour: colours[j] }));
     this.panel.show({ x: { title: "" }, y: { title: m === 1 ? names[0] : kind }, series });
   }
+}
+
+/**
+ * Return the columns of the observations and of the inputs: those that were chosen, else those of their names, else the others in
+ * their order where there are as many as are needed. An empty name is to be chosen by the reader.
+ */
+function matched(names, data, model) {
+  const wanted = [...model.observations, ...model.inputs], m = model.observations.length;
+  const chosen = data.columns?.length === m && data.inputs?.length === model.inputs.length ? [...data.columns, ...data.inputs] : [];
+  const found = wanted.map((name, k) => (names.includes(chosen[k]) && chosen[k]) || (names.includes(name) ? name : ""));
+  const free = names.filter((name) => !found.includes(name)), rest = [...free], open = found.filter((name) => !name).length;
+  const full = found.map((name) => name || (open === free.length ? rest.shift() : ""));
+  return [full.slice(0, m), full.slice(m)];
 }

@@ -35,13 +35,13 @@ export class TwoStates {
 
   async _ask() {
     try {
-      const found = await this.studio.ask("joint", { name: "main", across: this.across.value, up: this.up.value }, { quiet: true });
+      const found = await this.studio.ask("joint", { name: "main", across: this.across.value, up: this.up.value }, { quiet: true, work: true });
       if (!found) { this.seen = null; return; }
       this.fault.hidden = true;
       this.view ??= new PlaneView(this.place, { testid: "joint" });
       this.view.setFrame(found.arrays.frame);
     } catch (error) {
-      this.fault.textContent = error.message;
+      this.fault.textContent = error.cancelled ? "Cancelled; press Run to compute again." : error.message;
       this.fault.hidden = false;
     }
   }

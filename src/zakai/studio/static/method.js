@@ -69,6 +69,7 @@ export class Method {
         this.studio.state.options = rest;
         this.studio.remember();
         target.blur();
+        this.studio.run();
       },
     }), ABOUT[key])));
   }
@@ -85,7 +86,7 @@ export class Method {
     const names = (this.found?.methods ?? []).filter(({ holds }) => holds).map(({ name }) => name);
     const { text, data } = this.studio.state;
     this.studio.say("Measuring the methods that hold on the first observations …");
-    const found = await this.studio.ask("expected", { text, data, methods: names });
+    const found = await this.studio.ask("expected", { text, data, methods: names }, { work: true });
     if (!found) return;
     this.times = found.times;
     this.studio.say("Expected times are in the list of methods.");

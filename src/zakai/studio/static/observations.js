@@ -18,10 +18,11 @@ class Lazy {
     this.seen = studio.summary;
     this.panel.replaceChildren(h("p", { class: "small" }, "Computing the laws of the observations …"));
     try {
-      const found = await studio.ask(this.what, { name: "main" }, { quiet: true });
+      const found = await studio.ask(this.what, { name: "main" }, { quiet: true, work: true });
       if (found) this.draw(found); else this.seen = null;
     } catch (error) {
-      this.panel.replaceChildren(h("p", { class: "fault" }, error.message));
+      this.panel.replaceChildren(h("p", { class: error.cancelled ? "small" : "fault" }, error.cancelled ? "Cancelled; press Run to compute again." : error.message));
+      if (error.cancelled) studio.say("Cancelled.");
     }
   }
 }

@@ -29,8 +29,9 @@ export class Result {
   async filtered(summary) {
     this.available = new Map([["main", summary]]);
     this.name = "main";
+    if (!this.studio.running) this.studio.say("Drawing the density …");
     await this.show();
-    this.studio.say(`Filtered ${counted(summary.observations, "observation")} with ${summary.method}.`);
+    if (!this.studio.running) this.studio.say(`Filtered ${counted(summary.observations, "observation")} with ${summary.method}.`);
   }
 
   /** Another result is there, or another one is to be seen. */
@@ -65,7 +66,7 @@ export class Result {
       await this.show(name, found);
     } else {
       const main = this.available.get("main"), length = (main.last - main.first) / 5;
-      const found = await studio.ask("forecast", { of: "main", until: main.last + length, step: length / 100, name });
+      const found = await studio.ask("forecast", { of: "main", until: main.last + length, step: length / 100, name }, { work: true });
       if (!found) return;
       studio.say(`Forecast: ${number(length)} beyond the end of the record, without observations.`);
       await this.show(name, found);
@@ -75,7 +76,7 @@ export class Result {
   /** Ask for what can be seen. */
   async picture(window = {}) {
     const { name, coordinate } = this, columns = Math.round(Math.min(1000, Math.max(200, byId("picture").clientWidth)));
-    const found = await this.studio.ask("picture", { name, state: coordinate, columns, ...window }, { channel: "picture" });
+    const found = await this.studio.ask("picture", { name, state: coordinate, columns, ...window }, { channel: "picture", work: true });
     if (!found) return;
     this.view.setFrame(found.arrays.frame);
     byId("picture").dataset.shown = name;
@@ -93,10 +94,11 @@ export class Result {
 
   words(found) {
     byId("verdict").textContent = found.verdict;
+    const ahead = found.kind === "forecast"; // which has neither observations nor a likelihood
     const facts = [
-      ["log-likelihood", number(found.log_likelihood, 7) + (found.log_likelihood_error ? ` ± ${number(found.log_likelihood_error, 2)}` : "")],
-      ["method", found.method], ["observations", found.observations.toLocaleString("en")], ["states", String(found.states.length)],
-    ];
+      ahead ? null : ["log-likelihood", number(found.log_likelihood, 7) + (found.log_likelihood_error ? ` ± ${number(found.log_likelihood_error, 2)}` : "")],
+      ["method", found.method], [ahead ? "times" : "observations", found.observations.toLocaleString("en")], ["states", String(found.states.length)],
+    ].filter(Boolean);
     byId("facts").replaceChildren(...facts.map(([name, value]) => h("div", {}, h("dt", {}, name), h("dd", { "data-testid": `fact-${name}` }, value))));
     const notes = [...found.warnings, ...(found.notes ?? [])], box = byId("warnings");
     box.hidden = !notes.length;

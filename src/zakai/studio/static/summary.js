@@ -13,7 +13,7 @@ export class Summary {
     this.panel.replaceChildren(
       h("p", { class: "lead" }, `${found.method}: ${found.why}.`),
       found.health.length ? table(["figure", "over the record", "bound"], found.health.map(({ name, about, span, bound }) => [
-        [h("strong", {}, name), h("br"), h("small", {}, about)], span, bound === null ? "–" : number(bound, 3),
+        [h("strong", {}, name), h("br"), h("small", {}, about)], span.replaceAll("-", "−"), bound === null ? "–" : number(bound, 3),
       ].map((cell) => (Array.isArray(cell) ? h("div", {}, cell) : cell))), "health") : h("p", {}, "The method reports no figures: it is exact."),
     );
   }
