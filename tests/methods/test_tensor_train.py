@@ -183,6 +183,20 @@ def test_differences_of_the_evidence_are_right_where_runs_have_their_choices_in_
         assert abs(found - (log_likelihood(1.0 + apart, "yau-yau") - exact)) < 3e-4
 
 
+def test_a_chain_in_any_order_of_its_states_has_small_ranks():
+    def ranks(order):
+        drift = [f"-x{i}**3/3 + 0.8*sin(x{i + 1})" if i < 4 else f"-x{i}**3/3" for i in range(5)]
+        model = zakai.Model(
+            state=[f"x{i}" for i in order], drift=[drift[i] for i in order], diffusion=(0.5 * np.eye(5)).tolist(),
+            observation=["x0", "x2"], observation_kind="samples", observation_noise=[[0.1, 0], [0, 0.1]],
+            prior={"kind": "gaussian", "mean": [0.0] * 5, "cov": [0.5] * 5},
+        )  # fmt: skip
+        record = zakai.Record([0.2, 0.5, 0.8], [[0.3, -0.2], [0.5, -0.4], [0.4, 0.2]], "samples")
+        return zakai.filter(model, record, "tensor-train", tolerance=2e-2, keep="moments").health["rank"][1:].mean()
+
+    assert ranks([2, 0, 4, 1, 3]) < 1.3 * ranks(range(5))
+
+
 def test_a_density_is_saved_to_the_bit_and_is_the_prior_of_a_later_record(tmp_path):
     model = track()
     _, record = zakai.simulate(model, np.array([0.3, 0.7, 1.0]), seed=2)

@@ -108,7 +108,7 @@ class Builder:
         if angles.any() and isinstance(function, Carried):
             function = function.about(self._turn(mass))
         closed = closed_axes(mass, angles, rule)
-        grid, D = place(function, mass, closed, rule, noise, stretch)
+        grid, D = place(function, mass, closed, rule, noise, stretch, self.prepared.system.order)
         if not (np.isfinite(grid.step).all() and np.isfinite(grid.basis).all() and np.isfinite(grid.low).all()):
             raise Unresolved("the points of a density have no finite bounds")
         control = mass.control(CONTROLS, rule.tolerance)

@@ -184,7 +184,7 @@ class Placed(NamedTuple):
 
 
 def place(
-    function: Callable[[Array], Array], mass: Mass, closed: Array, rule: Rule, noise: Array | None, stretch: float
+    function: Callable[[Array], Array], mass: Mass, closed: Array, rule: Rule, noise: Array | None, stretch: float, order: Array
 ) -> Placed:
     """Return the grid for a function.
 
@@ -195,15 +195,18 @@ def place(
         rule: the accuracy.
         noise: the covariance (n, n) that the frame is to make diagonal, None where there is none.
         stretch: a factor of the box.
+        order: of the states (n,), in which the frame is triangular.
     """
     mean, P = mass.moments()
     P = without_chance(P, mass.effective)
     # An angle that goes around has an axis of its own; noise between it and the others is left out.
     B, D, free = np.eye(len(mean)), np.diag(np.zeros(len(mean)) if noise is None else np.diag(noise)), np.flatnonzero(~closed)
     if len(free):
-        block = np.ix_(free, free)
-        together = min(TOGETHER, TOGETHER_TOLERANCES * rule.tolerance)
-        B[block], D[block] = frame_of(P[block], None if noise is None else noise[block], together)
+        rows = order[~closed[order]]
+        block, together = np.ix_(rows, rows), min(TOGETHER, TOGETHER_TOLERANCES * rule.tolerance)
+        found = frame_of(P[block], None if noise is None else noise[block], together)
+        B[np.ix_(free, free)] = 0.0
+        B[np.ix_(rows, free)], D[np.ix_(free, free)] = found
     z = np.linalg.solve(B, mass.points - mean[:, None])
     heavy = z[:, mass.heavy(rule.tolerance)]
     low = -stretch * np.maximum(rule.width, -REACH * heavy.min(axis=1))
