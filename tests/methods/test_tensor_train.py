@@ -183,6 +183,14 @@ def test_differences_of_the_evidence_are_right_where_runs_have_their_choices_in_
         assert abs(found - (log_likelihood(1.0 + apart, "yau-yau") - exact)) < 3e-4
 
 
+def test_a_lost_track_ends_with_a_sentence_that_gives_the_time_and_another_method():
+    model = track(observation=["sqrt(px**2 + py**2)", "atan2(py, px)"])
+    times, values = np.array([0.2, 0.5, 0.9]), np.array([[8.0, 0.4], [9000.0, 2.5], [8.0, 0.4]])
+    result = zakai.filter(model, zakai.Record(times, values, "samples"), "tensor-train", tolerance=2e-2)
+    (said,) = [words for words in result.warnings if "the density was lost" in words]
+    assert "at t = 0.5:" in said and said.endswith("take guided-particles")
+
+
 def test_a_chain_in_any_order_of_its_states_has_small_ranks():
     def ranks(order):
         drift = [f"-x{i}**3/3 + 0.8*sin(x{i + 1})" if i < 4 else f"-x{i}**3/3" for i in range(5)]

@@ -129,9 +129,11 @@ def warnings_of_run(
         gone = int(np.argmax(bad))
         if gone <= first:
             said = []
+        # A grid or a train of several states loses what particles may follow.
+        instead = f"; where they are right, {_PARTICLES}" if len(result.state) > 1 and "tolerance_ratio" in result.bounds else ""
         said.append(
             f"the density was lost at t = {result.times[gone]:.12g}: nothing after that time can be trusted; check that "
-            "observation and its noise, and whether the drift leads to infinity in a finite time"
+            f"observation and its noise, and whether the drift leads to infinity in a finite time{instead}"
         )
         first = min(first, gone)
     else:
