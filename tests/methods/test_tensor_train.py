@@ -191,6 +191,19 @@ def test_a_lost_track_ends_with_a_sentence_that_gives_the_time_and_another_metho
     assert "at t = 0.5:" in said and said.endswith("take guided-particles")
 
 
+def test_ranks_at_their_limit_do_not_ask_for_substeps_and_the_error_does_not_grow():
+    model = zakai.Model(
+        state=["x", "v", "w"], drift=["v", "-w*x - 0.2*v", "0"], diffusion=[[0, 0], [0.4, 0], [0, 0.3]], observation=["x"],
+        observation_kind="samples", observation_noise=[[0.02]],
+        prior={"kind": "gaussian", "mean": [1, 0, 1.5], "cov": [0.3, 0.3, 0.8]},
+    )  # fmt: skip
+    _, record = zakai.simulate(model, np.arange(1, 25) * 0.3, seed=2)
+    full, limited = (zakai.filter(model, record, "tensor-train", tolerance=1e-3, most_rank=rank) for rank in (24, 4))
+    assert limited.health["substeps"][1:].sum() < 2 * full.health["substeps"][1:].sum()
+    assert np.abs((limited.mean - full.mean) / np.sqrt(full.variance)).max() < 0.05
+    assert any("tolerance_ratio" in words for words in limited.warnings)
+
+
 def test_a_chain_in_any_order_of_its_states_has_small_ranks():
     def ranks(order):
         drift = [f"-x{i}**3/3 + 0.8*sin(x{i + 1})" if i < 4 else f"-x{i}**3/3" for i in range(5)]
