@@ -88,6 +88,23 @@ def test_particles_are_refused_as_grids_are():
     assert np.isfinite(zakai.filter(near, zakai.Record([0.05], [[0.3]], "samples"), "guided-particles").mean).all()
 
 
+@pytest.mark.parametrize("drift, mean", [(["x**2", "x - y"], [0.5, 0.0]), (["-x", "y**3 - y + x/5"], [0.0, 1.2])])
+def test_a_tensor_train_refuses_what_reaches_infinity(drift, mean):
+    noise = [["0.5", "0"], ["0", "0.5"]]
+    model = model_of(drift, mean, 0.3, diffusion=noise, observation=["sin(x) + y"], observation_noise=[["0.5"]])
+    record = zakai.Record(0.5 * np.arange(1, 8), np.zeros((7, 1)), "samples")
+    with pytest.raises(zakai.InputError, match="to infinity between t = "):
+        zakai.filter(model, record, "tensor-train")
+
+
+def test_a_tensor_train_without_finite_bounds_is_lost_with_a_warning():
+    noise = [["0.5", "0"], ["0", "0.5"]]
+    drift, mean = ["x*y", "x**2 - y"], [0.5, 0.0]
+    model = model_of(drift, mean, 0.3, diffusion=noise, observation=["sin(x) + y"], observation_noise=[["0.5"]])
+    result = zakai.filter(model, zakai.Record([0.5, 1.0], np.zeros((2, 1)), "samples"), "tensor-train")
+    assert np.isfinite(result.mean[1:]).all() or any("lost at t = " in words for words in result.warnings)
+
+
 def test_a_pole_in_the_density_of_two_states_is_refused():
     with pytest.raises(zakai.InputError, match=r"drift\[0\] = y/x is infinite within the density at t = 0, as at x = "):
         filtered(model_of(["y/x", "-y"]), 1.0)
