@@ -27,6 +27,25 @@ def test_a_linear_track_agrees_with_the_kalman_filter_through_gaps_and_missing_c
     assert abs(result.log_likelihood - exact.log_likelihood) < 2e-2
 
 
+def test_the_estimated_error_of_linear_oscillators_is_that_of_the_kalman_filter_but_for_a_factor():
+    model = zakai.Model(
+        state=["p", "v", "q", "w"], drift=["v", "-p - 0.3*v + 0.4*(q - p)", "w", "-q - 0.3*w + 0.4*(p - q)"],
+        diffusion=[[0, 0], [0.5, 0], [0, 0], [0, 0.5]], observation=["p + q", "q"], observation_kind="samples",
+        observation_noise=[[0.05, 0], [0, 0.1]],
+        prior={"kind": "gaussian", "mean": [1, 0, -1, 0], "cov": np.diag([0.5] * 4).tolist()},
+    )  # fmt: skip
+    ratios = []
+    for seed in (1, 2, 3):
+        times = np.cumsum(np.random.default_rng(seed).uniform(0.1, 0.5, 25))
+        _, record = zakai.simulate(model, times, seed=seed)
+        exact = zakai.filter(model, record, "kalman-bucy")
+        result = zakai.filter(model, record, "tensor-train")
+        errors = np.abs(result.mean - exact.mean) / np.sqrt(np.einsum("kii->ki", exact.cov))
+        ratios.append(result.health["error_estimate"][1:] / errors[1:].max(axis=1))
+    assert np.min(ratios) > 0.5
+    assert 0.8 < np.median(ratios) < 2.2
+
+
 def test_online_and_restarted_filters_equal_a_record_to_the_bit(tmp_path):
     model = track(observation=["sqrt(px**2 + py**2)", "atan2(py, px)"])
     times = np.array([0.2, 0.5, 0.6, 1.1])

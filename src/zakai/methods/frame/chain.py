@@ -22,6 +22,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from zakai.methods.frame.build import CLOUD, Builder
+from zakai.methods.frame.errors import Missed
 from zakai.methods.frame.moves import Flow, Kick, Move, Noise
 from zakai.methods.frame.placement import Mass
 from zakai.methods.frame.state import Half, Prepared, Unresolved
@@ -36,7 +37,7 @@ DEFECT = 3.0  # tolerances of mass that a motion may lose or gain before its box
 LOST = 0.2  # mass that a chain of substeps may lose before it is divided
 MOST_SUBSTEPS = 128
 FAR = 1e100  # a state that has left every bounded set
-ROUNDING = 0.1  # share of the error of a cross interpolation that rounding after a convolution may add
+ROUNDING = 0.01  # share of the error of a cross interpolation that rounding after a convolution may add
 ALONE = 1e-9  # off-diagonal noise in a frame that needs no correction
 
 
@@ -44,7 +45,8 @@ ALONE = 1e-9  # off-diagonal noise in a frame that needs no correction
 class Prediction:
     """A density before an observation, as a function, with points of it.
 
-    `log_mass` is the logarithm of its mass, `defect` the mass that was lost, `slope` (n, n) the linearised motion.
+    `log_mass` is the logarithm of its mass, `defect` the mass that was lost, `slope` (n, n) the linearised motion.  What
+    its builds `missed` counts by factors.
     """
 
     function: Carried
@@ -53,6 +55,7 @@ class Prediction:
     defect: float
     slope: Array
     motions: tuple[tuple[Half, ...], ...] = ()
+    missed: tuple[tuple[float, Missed], ...] = ()
 
     @property
     def log_scale(self) -> float:
@@ -74,6 +77,7 @@ class Chain:
     moves: list[Move] = field(default_factory=list)
     lost: float = 0.0
     halves: list[Half] = field(default_factory=list)
+    missed: list[Missed] = field(default_factory=list)
     _slope: Array = field(init=False)
 
     def _carried(self, u: Train, t0: float, t1: float) -> tuple[Carried, Mass]:
@@ -81,7 +85,9 @@ class Chain:
         prepared, motion = self.prepared, self.prepared.motion
         points, weights = u.cloud(CLOUD)
         steps = motion.steps(self.interval, points, (t0, t1), self.values, 0.1 * self.builder.rule.tolerance)
-        ends, logs = motion.ends(points, motion.path(self.interval, t0, t1, self.values, steps))
+        path = motion.path(self.interval, t0, t1, self.values, steps)
+        ends, logs = motion.ends(points, path)
+        self.missed = [part.moved(motion.ends(part.mass.points, path)[0]) for part in self.missed]
         finite = (np.abs(ends) < FAR).all(axis=0) & np.isfinite(logs)  # NaN is not below, either
         if not finite.all():
             self.lost = max(self.lost, float(weights[~finite].sum()))
@@ -136,18 +142,19 @@ class Chain:
     def _built(self, function: Carried, mass: Mass, noise: Array | None) -> tuple[Train, Array, float]:
         """Return a moved density, the noise in its frame, and its mass; on a wider box where mass is missing."""
         prepared = self.prepared
-        best: tuple[float, Train, Array] | None = None
+        best: tuple[float, Train, Array, Missed] | None = None
         for stretch in STRETCHES:
             v, D = self.builder.build(function, mass, noise, stretch)
             defect = abs(v.mass - 1.0)
             if best is None or prepared.system.weighted or defect < best[0]:
-                best = defect, v, D
+                best = defect, v, D, self.builder.missed
             tolerance = self.builder.rule.tolerance
             # What the cross interpolation misses is not outside of the box.
             if prepared.system.weighted or defect < DEFECT * tolerance or self.builder.reports[-1].on_grid > tolerance:
                 break
         assert best is not None
-        _, v, D = best
+        _, v, D, missed = best
+        self.missed.append(missed)
         if not v.mass > 0 or not math.isfinite(v.mass):
             raise Unresolved(f"a density has mass {v.mass:.1g} after a motion")
         return v, D, v.mass
@@ -172,7 +179,7 @@ class Chain:
     def predict(self, u: Train, count: int) -> Prediction:
         """Return the prediction by so many substeps; Unresolved where the density is lost."""
         start, stop = self.interval.start, self.interval.stop
-        self.moves, self.halves = [], []
+        self.moves, self.halves, self.missed = [], [], []
         self._slope = np.eye(self.prepared.model.n)
         if stop <= start:
             return Prediction(*self._carried(u, start, stop), 0.0, 0.0, self._slope, (tuple(self.halves),))
@@ -183,7 +190,8 @@ class Chain:
             u, gained, lost = self._middle(u, at, middle, length)
             log_mass, defect, at = log_mass + gained, defect + lost, middle
         function, mass = self._carried(u, at, stop)
-        return Prediction(function, mass, log_mass, defect, self._slope, (tuple(self.halves),))
+        missed = tuple((1.0, part) for part in self.missed)
+        return Prediction(function, mass, log_mass, defect, self._slope, (tuple(self.halves),), missed)
 
     def first(self, u: Train, count: int) -> tuple[Prediction, int]:
         """Return the prediction by the fewest substeps, `count` or more, that keep the mass, and their number."""

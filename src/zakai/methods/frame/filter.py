@@ -19,6 +19,7 @@ from zakai.methods._protocol import Info
 from zakai.methods.frame import again
 from zakai.methods.frame.build import CONTROLS, Builder, difference
 from zakai.methods.frame.chain import MOST_SUBSTEPS, Chain, Prediction, extrapolated
+from zakai.methods.frame.errors import carried, in_deviations, total
 from zakai.methods.frame.placement import Mass
 from zakai.methods.frame.state import Choice, Control, Made, Prepared, State, Substeps, Unresolved
 from zakai.methods.frame.update import depth_of, update
@@ -34,8 +35,7 @@ AUDIT = 10  # intervals between comparisons of s and 2 s substeps, where the las
 TIME_SHARE, GAIN, ACCEPTED, SAFETY = 1.0, 4.0, 8.0, 0.7
 IN_TAILS = 0.03  # error of a mean over tolerance e^depth: linear tracks with observations 4 and 6 deviations away
 BEYOND = 0.3  # error of a mean over the distance of an observation, where a Gaussian stands for the tails
-# Error of a mean over the error of a build in L1: those of different builds have different signs.
-OF_MEAN = 0.6
+OF_MEAN = 0.6  # error of a mean over what a motion loses of the mass, what is near an edge, and the error of time in L1
 OF_TAILS = 0.25  # growth of the logarithm of a relative error with the depth, on wide tracks seen by bearings
 WITHIN = 3.0  # tolerances that the error of a mean may reach
 FIGURES = (
@@ -63,9 +63,9 @@ def init(prepared: Prepared, prior: Any) -> State:
     if choices is not None and (made := builder.choice(v)) is not None:
         choices.made[key] = made
     assert model.n == len(mass.points) and len(theta) == len(prepared.theta)
-    report = builder.reports[-1]
     _, P = mass.unwrapped(system.base.angles).moments()
-    control = Control(0, Substeps(0.0, -AUDIT, False, 0.0), (OF_MEAN * report.off_grid) ** 2 * P)
+    error = builder.missed.of_mean(np.zeros(len(builder.missed.relative)), P, system.base.angles)
+    control = Control(0, Substeps(0.0, -AUDIT, False, 0.0), error.square)
     return State.of(v.scaled(1.0 / v.mass), control)
 
 
@@ -189,7 +189,8 @@ def _step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[tupl
     builder = builder_of(prepared, state)
     chain = Chain(prepared, interval, values, builder)
     prediction, count, time = predicted(chain, state)
-    updated = update(builder, prediction, prepared.motion.likelihood(interval, values))
+    likelihood = prepared.motion.likelihood(interval, values)
+    updated = update(builder, prediction, likelihood)
     v, rule = updated.density, builder.rule
     if choices is not None and updated.choice is not None:
         tails = updated.prediction.terms[0].density.tails
@@ -200,11 +201,18 @@ def _step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[tupl
     off_grid, edge = sum(report.off_grid for report in reports), max(report.edge for report in reports)
     # Far out a density is known relative to its largest value only; beyond, a Gaussian stands for it.
     far = min(IN_TAILS * rule.tolerance * math.exp(min(depth, 50.0)), BEYOND * math.sqrt(2.0 * max(depth, 0.0)))
-    new = math.hypot(OF_MEAN * (off_grid + prediction.defect + edge + time.error), far)
+    new = math.hypot(OF_MEAN * (prediction.defect + edge + time.error), far)
+    angles = prepared.system.base.angles
+    parts = [
+        (factor, missed.of_mean(prepared.motion.logs(likelihood, missed.mass.points), cov, angles))
+        for factor, missed in prediction.missed
+    ]
+    parts.append((1.0, builder.missed.of_mean(np.zeros(len(builder.missed.relative)), cov, angles)))
     # Where an observation leads into the tails, the relative errors of earlier builds are larger.
     larger = math.exp(2.0 * OF_TAILS * min(max(depth, 0.0), 50.0))
-    errors = larger * _carried_error(control.error, prediction, prepared, cov) + new**2 * cov
-    error = _in_deviations(errors, cov)
+    before = carried(control.error, prediction.mass.unwrapped(angles), prediction.slope, cov)
+    errors = larger * before + new**2 * cov + total(parts, len(mean)).square
+    error = in_deviations(errors, cov)
     health = {
         "error_estimate": error,
         "tolerance_ratio": error / (WITHIN * prepared.tolerance),
@@ -225,7 +233,7 @@ def _step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[tupl
 
 def error_of(prepared: Prepared, state: State) -> float:
     """Return the estimated error of the mean of a state, in standard deviations."""
-    return _in_deviations(state.control.error, state.train(prepared.system.periods).moments()[1])
+    return in_deviations(state.control.error, state.train(prepared.system.periods).moments()[1])
 
 
 def builder_of(prepared: Prepared, state: State) -> Builder:
@@ -244,24 +252,6 @@ def predicted(chain: Chain, state: State) -> tuple[Prediction, int, Substeps]:
     if length > 0 and not exact and (time.both or number - time.audited >= AUDIT):
         return _audited(chain, u, prediction, count, number)
     return prediction, count, time
-
-
-def _carried_error(error: Array, prediction: Prediction, prepared: Prepared, cov: Array) -> Array:
-    """Return what a motion and an observation leave of an error of the mean, as covariances (n, n).
-
-    An observation does not change the ratio of a wrong density to the right one.  Where its logarithm is c'x the mean is off by
-    P c, before and after with the covariance P of that time.
-    """
-    _, P = prediction.mass.unwrapped(prepared.system.base.angles).moments()
-    scale = np.maximum(np.sqrt(np.diag(P)), 1e-300)
-    unit = P / np.outer(scale, scale) + 1e-9 * np.eye(len(P))
-    left = np.linalg.solve(unit, (cov / scale).T).T / scale @ prediction.slope
-    return np.asarray(left @ error @ left.T)
-
-
-def _in_deviations(error: Array, cov: Array) -> float:
-    """Return the largest error of a mean in standard deviations, of covariances (n, n)."""
-    return float(np.sqrt(np.max(np.diag(error) / np.maximum(np.diag(cov), 1e-300))))
 
 
 def _audited(chain: Chain, u: Train, coarser: Prediction, count: int, number: int) -> tuple[Prediction, int, Substeps]:
@@ -283,4 +273,6 @@ def _audited(chain: Chain, u: Train, coarser: Prediction, count: int, number: in
     found = Substeps((both if extrapolate else plain) / length, number, extrapolate, error / GAIN)
     extra = extrapolated(finer, coarser)
     motions = (*finer.motions, *coarser.motions)
-    return Prediction(extra, finer.mass, finer.log_mass, finer.defect, finer.slope, motions), more, found
+    missed = [(4.0 / 3.0 * factor, part) for factor, part in finer.missed]
+    missed += [(-1.0 / 3.0 * factor, part) for factor, part in coarser.missed]
+    return Prediction(extra, finer.mass, finer.log_mass, finer.defect, finer.slope, motions, tuple(missed)), more, found

@@ -65,6 +65,18 @@ class Mass:
         weights = self.weights * np.exp(logs - logs.max())
         return Mass(self.points, weights / weights.sum())
 
+    def power(self, logs: Array, few: float) -> float:
+        """Return the largest power of a likelihood that leaves enough effective points, or most of them."""
+        target = min(few, 0.7 * self.effective)
+        low, high = -12.0, 0.0  # of log10: powers may be very small at first
+        for _ in range(24):
+            middle = 0.5 * (low + high)
+            if self.reweighted(10.0**middle * logs).effective > target:
+                low = middle
+            else:
+                high = middle
+        return float(10.0**low)
+
     @property
     def effective(self) -> float:
         """The effective number of points."""

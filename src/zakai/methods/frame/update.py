@@ -57,7 +57,7 @@ def update(builder: Builder, prediction: Prediction, likelihood: Likelihood) -> 
         prediction = replace(prediction, function=prediction.function.with_tails())
     loose = max(1.0, ROUGHLY / builder.rule.tolerance)
     while mass.reweighted((1.0 - done) * _finite(logs)).effective < FEW and powers < MOST_POWERS:
-        power = min(done + (1.0 - done) * _power(mass, (1.0 - done) * _finite(logs)), 1.0)
+        power = min(done + (1.0 - done) * mass.power((1.0 - done) * _finite(logs), 1.5 * FEW), 1.0)
         v, _ = _product(builder, prediction, mass.reweighted((power - done) * _finite(logs)), likelihood, power, loose)
         mass = Mass(*v.cloud(CLOUD))
         logs, done, powers = motion.logs(likelihood, mass.points), power, powers + 1
@@ -104,19 +104,6 @@ def _off_centre(v: Train) -> bool:
     shift = np.linalg.solve(grid.basis, mean - grid.centre)
     scale = np.sqrt(np.maximum(np.diag(np.linalg.solve(grid.basis, np.linalg.solve(grid.basis, P).T)), 0.0))
     return bool((free & ((np.abs(shift) > OFF_CENTRE) | (scale < NARROW) | (scale > WIDE))).any())
-
-
-def _power(mass: Mass, logs: Array) -> float:
-    """Return the largest power of a likelihood that leaves enough effective points, or most of them."""
-    target = min(1.5 * FEW, 0.7 * mass.effective)
-    low, high = -12.0, 0.0  # of log10: powers may be very small at first
-    for _ in range(24):
-        middle = 0.5 * (low + high)
-        if mass.reweighted(10.0**middle * logs).effective > target:
-            low = middle
-        else:
-            high = middle
-    return float(10.0**low)
 
 
 def depth_of(u: Carried, mass: Mass, posterior: Train, tolerance: float) -> float:
