@@ -26,7 +26,7 @@ AFTER_GAP = (
     "a path is observed after a gap: the increment since the last observation of that coordinate acts as one factor at its end, "
     "which is exact only as the gaps shrink"
 )
-KEPT = 64  # intervals whose preparation is kept, of a system that does not depend on time
+KEPT = 64  # intervals whose preparation is kept
 
 
 class Moment(NamedTuple):
@@ -57,8 +57,9 @@ class Feed:
         self.m, self.kind = model.m, model.observation_kind
         self.empty, state = setting.begin()
         self._noise_varies = noise_varies(model)
-        # What is prepared depends on the length alone: the last lengths are kept.
+        # What is prepared depends on the length alone where nothing depends on time: the last lengths are kept.
         self._kept = lru_cache(KEPT)(partial(self._prepared, 0.0)) if setting.autonomous else None
+        self._first: dict[tuple[Any, ...], Prepared] = {}  # what is prepared for the first interval of each kind
         start = float(model.start)
         self.now = Moment(start, 0.0, state, None, (0.0,) * self.m, (start,) * self.m, self.empty.notes)
 
@@ -132,10 +133,19 @@ class Feed:
         observed = np.array([seen])
         inputs = None if inputs is None else inputs.part(start, stop)
         schedule = Schedule(np.array([start]), np.array([stop]), observed, np.where(observed, [elapsed], 0.0), inputs)
-        if inputs is None and setting.method.rescheduled is not None:
-            prepared = setting.method.rescheduled(self.empty, schedule)
-        else:
+        if inputs is not None or setting.method.moved is None:
             prepared = setting.method.prepare(setting.model, schedule, setting.theta, **setting.options)
+        else:
+            length = length_of(start, stop)
+            key = seen, tuple([one == length for one in elapsed]), length > 0
+            known = self._first.get(key)
+            if known is None:
+                if len(self._first) == KEPT:
+                    self._first.clear()
+                prepared = setting.method.prepare(setting.model, schedule, setting.theta, **setting.options)
+                self._first[key] = prepared
+            else:
+                prepared = setting.method.moved(known, schedule)
         noise = notes_on_noise(setting.model, schedule) if self._noise_varies else ()
         return prepared, (*noise, *prepared.notes)
 

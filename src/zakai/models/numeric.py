@@ -122,11 +122,14 @@ def numpy_function(expressions: Any, model: Model, shape: Sequence[int] | None =
     def function(x: Any, t: Any, theta: Any, u: Any = None, z: Any = None) -> np.ndarray:
         if needs_inputs and u is None:
             raise InputError(f"{model.source}: inputs: the values of {', '.join(model.inputs)} are missing")
-        x, t, theta = (_inexact(a) for a in (x, t, theta))
-        u, z = (None if a is None else np.asarray(a, dtype=float) for a in (u, z))
-        shapes = {x.shape[:-1], t.shape, theta.shape[:-1], *(a.shape[:-1] for a in (u, z) if a is not None)} - {()}
+        x, t, theta = _inexact(x), _inexact(t), _inexact(theta)
+        shapes = {x.shape[:-1], t.shape, theta.shape[:-1]}
+        if u is not None or z is not None:
+            u, z = (None if a is None else np.asarray(a, dtype=float) for a in (u, z))
+            shapes |= {a.shape[:-1] for a in (u, z) if a is not None}
+        shapes.discard(())
         batch = shapes.pop() if len(shapes) == 1 else np.broadcast_shapes(*shapes)
-        derivative = np.iscomplexobj(x) or np.iscomplexobj(t) or np.iscomplexobj(theta)
+        derivative = complex in (x.dtype, t.dtype, theta.dtype)
         with np.errstate(all="ignore"):
             values = program.run(x, t, theta, COMPLEX if derivative else REAL, u, z)
         result = np.empty((*batch, len(flat)), complex if derivative else float)

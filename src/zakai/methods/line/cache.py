@@ -30,8 +30,6 @@ class Derived(Enum):
     HIDDEN_DRIFT = "the error of f between the points of a grid"
     PRECISION = "the inverse of S for some coordinates"
     SAMPLE_NOISE = "the inverse of S of a sample, and the constant of its density"
-    ONE_PRECISION = "the inverse of a constant S of what is seen in one interval, and the constant of its likelihood"
-    STEADY = "a coefficient that depends neither on x nor on t"
     KINKS = "the states between two at which coefficients have kinks"
 
 

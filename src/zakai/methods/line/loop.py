@@ -182,9 +182,9 @@ class Piece(NamedTuple):
     @classmethod
     def of(cls, first: int, before: State, densities: Array, centres: Array, spacings: Array, reports: Array) -> Piece:
         """Return steps after which the grid stays."""
-        error, log_floor = reports[-1, [ERROR, FLOOR]].tolist()
+        error, log_floor = float(reports[-1, ERROR]), float(reports[-1, FLOOR])
         centre, spacing = float(centres[-1]), float(spacings[-1])
-        last = before._replace(values=densities[-1], centre=centre, spacing=spacing, error=error, log_floor=log_floor)
+        last = State(densities[-1], before.origin, centre, spacing, before.unit, before.closed, error, log_floor)
         return cls(first, before, densities, centres, spacings, reports, last)
 
 
@@ -208,26 +208,27 @@ def compiled_steps(prepared: Prepared, rows: slice, state: State, observed: np.n
     pieces: list[Piece] = []
     trials, first, placement, observed = 0, rows.start, STAY, np.ascontiguousarray(observed, float)
     most = prepared.largest
-    while first < rows.stop and trials < TRIALS and state.window.size <= most:
+    while first < rows.stop and trials < TRIALS and len(state.values) <= most:
         trials += 1
-        stop = rows.stop
-        if misses_drift(prepared, state.window):
+        stop, window = rows.stop, state.window
+        if misses_drift(prepared, window):
             interval = float(prepared.schedule.starts[first]), float(prepared.lengths[first])
-            values, window = on_grid_for_drift(prepared, np.asarray(state.values), state.window, *interval)
+            values, window = on_grid_for_drift(prepared, np.asarray(state.values), window, *interval)
             state, stop = state._replace(values=values, centre=window.centre, spacing=window.spacing), first + 1
             if window.size > most:
                 break
         now = observed[first - rows.start : stop - rows.start]
         if prepared.gaussian:
-            piece, status, answer = _on_one_table(prepared, slice(first, stop), state, now)
+            piece, status, answer = _on_one_table(prepared, slice(first, stop), state, window, now)
         else:
             result = modal.advanced(prepared, first, stop, state, now, placement)
             status, answer = result.status, result.answer
             piece = Piece.of(first, state, *result[:4])._replace(coarse=result.coarse) if len(result.reports) else None
         if piece is not None:
-            last = regridded(prepared, piece.last) if status == Status.AFTER or prepared.cut_up else piece.last
-            pieces.append(piece._replace(last=last))
-            trials, state, first = 1, last, first + len(piece.reports)
+            if status == Status.AFTER or prepared.cut_up:
+                piece = piece._replace(last=regridded(prepared, piece.last))
+            pieces.append(piece)
+            trials, state, first = 1, piece.last, first + len(piece.reports)
         if status == Status.FAILED or (status == Status.OK and piece is None):
             break
         if status == Status.RANGE:
@@ -244,11 +245,13 @@ def compiled_steps(prepared: Prepared, rows: slice, state: State, observed: np.n
     return pieces
 
 
-def _on_one_table(prepared: Prepared, rows: slice, state: State, observed: np.ndarray) -> tuple[Piece | None, Status, Array]:
+def _on_one_table(
+    prepared: Prepared, rows: slice, state: State, window: lw.Window, observed: np.ndarray
+) -> tuple[Piece | None, Status, Array]:
     """Return the first steps of `rows` by kernels or splitting, why they end, and the grid that is needed."""
     together = 1 if prepared.cut_up else TOGETHER if prepared.mixed else len(observed)
     here = slice(rows.start, min(rows.stop, rows.start + together))
-    grid = grid_of(prepared, state.window, here)
+    grid = grid_of(prepared, window, here)
     if grid is None:
         return None, Status.FAILED, np.zeros(3)
     start = Start(np.ascontiguousarray(state.values), float(state.error), float(state.log_floor))

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from zakai.methods.line.cache import CacheKey, Derived, GridCache, grid_cache_of
-from zakai.methods.line.model import System, finite, within
+from zakai.methods.line.model import System, finite
 from zakai.methods.line.yau import Kernels, YauLine
 from zakai.methods.system.notes import OMITTED
 from zakai.methods.yau.kernel import PowerSeries
@@ -128,6 +128,21 @@ class Prepared:
         result = object.__new__(Prepared)
         known = vars(self)
         vars(result).update({name: known[name] for name in FIELDS}, schedule=schedule, shares=shares, cut_up=cut_up)
+        return result
+
+    def moved(self, schedule: Schedule) -> Prepared:
+        """Return the same for another interval with the same sensors, where only its length and coefficients in time are new."""
+        if not self.timed or self.kernels is not None or self.parts is not None or not self.fast[0]:
+            return self.over(schedule)
+        lengths = schedule.lengths
+        result = object.__new__(Prepared)
+        vars(result).update(vars(self), schedule=schedule, lengths=lengths)
+        c = coefficients_of(result, self.coefficients)
+        if c.parts[0] != 1:
+            return self.over(schedule)
+        kinds, _, shares, _, _, kernels, *_ = self.steps
+        steps = Steps(kinds, lengths, shares, c.precisions, c.constants, kernels, c.drifts, c.outputs, c.covariances)
+        vars(result).update(coefficients=c, steps=steps)
         return result
 
     @cached_property
@@ -307,15 +322,16 @@ STEADY = ("divides", "gaussian", "timed", "weak", "mixed", "cut", "limits")
 FIELDS = (*(field.name for field in fields(Prepared)), *STEADY)
 
 
-def coefficients_of(prepared: Prepared) -> Coefficients:
-    """Return what the loop needs of the coefficients in time of all intervals."""
+def coefficients_of(prepared: Prepared, steady: Coefficients | None = None) -> Coefficients:
+    """Return what the loop needs of the coefficients in time of all intervals; of one, `steady` has those that are constant."""
     schedule, system, theta = prepared.schedule, prepared.system, prepared.theta
     count, seen, m = len(schedule), schedule.seen, system.m
     starts, lengths, stops = schedule.starts[:, None], prepared.lengths[:, None], schedule.stops[:, None]
     resolved = system.resolved and not prepared.mixed
     if prepared.timed:
-        nodes = within(starts + lengths * GAUSS_NODES, starts, stops)
-        t = np.concatenate([nodes, stops] if resolved else [nodes, stops, probed(starts, stops)], axis=1)
+        t = np.minimum(starts + lengths * GAUSS_NODES, np.nextafter(stops, starts))
+        if system.samples or not resolved:
+            t = np.concatenate([t, stops] if resolved else [t, stops, probed(starts, stops)], axis=1)
     else:
         t = np.concatenate([np.full((count, 1), prepared.model.start), stops], axis=1)
     size = len(GAUSS_NODES) if prepared.timed else 1
@@ -323,14 +339,12 @@ def coefficients_of(prepared: Prepared) -> Coefficients:
     if not system.samples and system.steady_observation and system.steady_noise:
         ends = slice(1)
 
-    def everywhere(function: Callable[..., np.ndarray], name: str | None) -> np.ndarray:
-        """Return a function of time alone at all times; one that is constant has a name."""
-        if name is None:
+    def everywhere(function: Callable[..., np.ndarray], constant: bool) -> np.ndarray:
+        """Return a function of time alone at all times."""
+        if not constant:
             return function(_X, t, theta)
-        value = prepared.once(Derived.STEADY, name, lambda: function(_X, np.full((1, 1), prepared.model.start), theta))
-        result = np.empty((*t.shape, *value.shape[2:]), value.dtype)
-        result[...] = value
-        return result
+        value = function(_X, np.full((1, 1), prepared.model.start), theta)
+        return np.broadcast_to(value, (*t.shape, *value.shape[2:]))
 
     def precision(noise: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         if system.general:  # the loop takes only intervals without observations
@@ -346,33 +360,33 @@ def coefficients_of(prepared: Prepared) -> Coefficients:
         factors = np.broadcast_to(np.eye(size + 1), (count, size + 1, size + 1))
     else:
         assert system.separated is not None
-        factors = everywhere(system.separated[0], None)
-    G = np.zeros(t.shape)
-    if prepared.divides:
-        G = everywhere(system.covariance, "G" if system.steady_covariance else None)[..., 0, 0]
-
-    def noise() -> np.ndarray:
-        return everywhere(system.noise, "S" if system.steady_noise else None)
-
-    if count == 1 and system.steady_noise:  # one interval of an online filter
-        precisions, constants = prepared.once(Derived.ONE_PRECISION, seen.tobytes(), lambda: precision(noise()[:, ends]))
+        factors = everywhere(system.separated[0], False)
+    if steady is not None and system.steady_covariance:
+        covariances = steady.covariances
     else:
-        precisions, constants = precision(noise()[:, ends])
-    parts = np.ones(count, int)
-    if resolved and prepared.timed:
+        G = everywhere(system.covariance, system.steady_covariance)[..., 0, 0] if prepared.divides else np.zeros(t.shape)
+        covariances = np.array(G[:, own], order="C")
+    if steady is not None and system.steady_noise:
+        precisions, constants = steady.precisions, steady.constants
+    else:
+        noise = everywhere(system.noise, system.steady_noise)
+        precisions, constants = precision(noise[:, ends])
+    if not prepared.timed or not count:
+        parts = np.ones(count, int)
+    elif resolved:
         parts = np.isfinite(factors).all(axis=(1, 2)).astype(int)
-    elif prepared.timed and count:
+    else:
         terms = _mixed_terms(prepared, t) if prepared.mixed else factors
         parts = parts_needed(terms[:, probes], terms[:, own])
         if not system.steady_covariance:
             parts = np.maximum(parts, parts_needed(G[:, probes, None], G[:, own, None]))
         if not (system.samples or system.steady_noise):
-            parts = np.maximum(parts, parts_needed(precision(noise()[:, probes])[0], precisions))
-    drifts, outputs, covariances = (np.array(part, order="C") for part in (factors[:, own], factors[:, ends], G[:, own]))
+            parts = np.maximum(parts, parts_needed(precision(noise[:, probes])[0], precisions))
+    drifts, outputs = (np.array(factors[:, part], order="C") for part in (own, ends))
     return Coefficients(drifts, outputs, covariances, precisions, constants, parts)
 
 
-_X = np.zeros((1, 1, 1))
+_X = np.zeros(1)
 
 
 def _mixed_terms(prepared: Prepared, t: np.ndarray) -> np.ndarray:

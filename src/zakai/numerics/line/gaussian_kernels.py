@@ -129,12 +129,14 @@ def filtered(now: Array, taps: Array, after: Array, scale: Array, narrow: bool) 
         below, above = padded[count - n : count - n + size], padded[count + n : count + n + size]
         lower, higher = padded[count - n - 1 : count - n - 1 + size], padded[count + n + 1 : count + n + 1 + size]
         near, far = weights[n], weights[n + 1]
-        for j in range(size):
-            now[j] += near * (below[j] + above[j]) + far * (lower[j] + higher[j])
         if narrow:
-            near, far = abs(near), abs(far)
             for j in range(size):
-                moduli[j] += near * (below[j] + above[j]) + far * (lower[j] + higher[j])
+                inner, outer = below[j] + above[j], lower[j] + higher[j]
+                now[j] += near * inner + far * outer
+                moduli[j] += abs(near) * inner + abs(far) * outer
+        else:
+            for j in range(size):
+                now[j] += near * (below[j] + above[j]) + far * (lower[j] + higher[j])
     total, top, noise, lost = 0.0, 0.0, 0.0, 0.0
     for j in range(size):
         weight = after[j] * scale[j]
