@@ -218,8 +218,8 @@ class Method(Generic[P, S]):
     of which one has an infinitesimal imaginary part.  It returns the states after each step, their Infos, the derivatives (p,) of
     the sum of what they gained, and the last shifted states; or None, where `step` is to carry them.
 
-    Optional: `moved(prepared, schedule)` returns what `prepare` returns for one interval without inputs, from what is prepared for
-    another one, in which the same coordinates are seen and the same of them are increments over just the interval.
+    Optional: `moved(prepared, schedule)` returns what `prepare` returns for one interval without inputs, from what is prepared
+    for another one, in which the same coordinates are seen and the same of them are increments over just the interval.
 
     Optional: `backward` is the backward pass of `zakai.smooth`.
 

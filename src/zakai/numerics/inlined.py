@@ -8,10 +8,13 @@ from __future__ import annotations
 
 from typing import Any
 
+from numba.core import ir, types
 from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import CompilerBase, DefaultPassBuilder
-from numba.core.compiler_machinery import register_pass
+from numba.core.compiler_machinery import FunctionPass, register_pass
+from numba.core.ir_utils import build_definitions
 from numba.core.typed_passes import NativeLowering
+from numba.core.untyped_passes import IRProcessing
 
 
 class _WithoutEnvironment:
@@ -54,12 +57,34 @@ class _InlinedLowering(NativeLowering):
         return super().run_pass(state)
 
 
+@register_pass(mutates_CFG=True, analysis_only=False)
+class _LiteralArguments(FunctionPass):
+    """Literal booleans as constants, so that the branches that they exclude are not compiled, nor what only these call."""
+
+    _name = "literal_arguments"
+
+    def __init__(self) -> None:
+        super().__init__()
+
+    def run_pass(self, state: Any) -> Any:
+        found = False
+        for block in state.func_ir.blocks.values():
+            for assigned in block.find_insts(ir.Assign):
+                given = state.args[assigned.value.index] if isinstance(assigned.value, ir.Arg) else None
+                if isinstance(given, types.BooleanLiteral):
+                    assigned.value, found = ir.Const(given.literal_value, assigned.loc), True
+        if found:
+            state.func_ir._definitions = build_definitions(state.func_ir.blocks)
+        return found
+
+
 class InlinedCompiler(CompilerBase):
     """The compiler of `helper`."""
 
     def define_pipelines(self) -> Any:
-        """Return the default pipeline with another last step."""
+        """Return the default pipeline with literal booleans as constants, and with another last step."""
         passes = DefaultPassBuilder.define_nopython_pipeline(self.state)
+        passes.add_pass_after(_LiteralArguments, IRProcessing)
         passes.passes = [(_InlinedLowering if p is NativeLowering else p, text) for p, text in passes.passes]
         passes._finalized = False
         passes.finalize()

@@ -290,7 +290,8 @@ class Prepared:
         system, yau, closed = self.system, self.yau, bool(self.model.periodic)
         whole = yau is not None and yau.unobserved and yau.steady_gauge and self.kernels is not None
         always = whole and yau is not None and (not system.moving if system.samples else yau.affine)
-        return Mechanisms(whole, self.divides and not always, system.samples, self.weak, closed)
+        splits = self.divides and not always
+        return Mechanisms(whole, splits, splits and self.timed, system.samples, self.weak, closed)
 
     @cached_property
     def fast(self) -> list[bool]:
@@ -444,6 +445,7 @@ def steps_of(prepared: Prepared) -> Steps:
 
 
 ROUNDS = 2  # of cutting, after which what is not resolved is left to adaptive substeps
+
 
 def parts_of(prepared: Prepared) -> Parts | None:
     """Return the parts of the intervals of a schedule, None where no interval needs any."""

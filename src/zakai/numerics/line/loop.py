@@ -69,8 +69,9 @@ _V, _M = float64[::1], float64[:, ::1]
 
 
 @cache
-def _loop(kernels: bool, splits: bool, samples: bool, weak: bool, closed: bool) -> Any:
+def _loop(kernels: bool, splits: bool, varying: bool, samples: bool, weak: bool, closed: bool) -> Any:
     """Return the loop with the code of these mechanisms only."""
+
     @kernel(
         types.UniTuple(int64, 2)(  # type: ignore[no-untyped-call]
             START_TYPE, GRID_TYPE, STEPS_TYPE, int64, _M, _V, CONSTANTS_TYPE, RESULTS_TYPE
@@ -86,7 +87,7 @@ def _loop(kernels: bool, splits: bool, samples: bool, weak: bool, closed: bool) 
         averages, cosines, sines = known
         densities, out = results
         negligible, most, generous, size, length = limits[0], limits[1], limits[4], values.size, table.shape[3]
-        half, timed, movable, near = size // 2, table.shape[0] > 1, not closed, length == size + 2 * MARGIN
+        half, timed, near = size // 2, table.shape[0] > 1, length == size + 2 * MARGIN
         now, local = values.copy(), np.empty((table.shape[1], table.shape[2], size))
         b, change, channel, answer = np.empty(size), np.empty(size), np.empty(6), out[-1]
         channel[0] = np.nan
@@ -106,7 +107,7 @@ def _loop(kernels: bool, splits: bool, samples: bool, weak: bool, closed: bool) 
                 place = start
             if kernels:
                 kernel_of(kernel_parameters[k], observed[i], tau if kind == KERNEL else np.inf, channel)
-            if movable:
+            if not closed:
                 middle = offset + spacing * (start + half)
                 first, last = extent(now, (low, high), channel, local, c, middle, spacing, cut)
                 answer[0], answer[1], answer[2], status = first, last, spacing, OK
@@ -135,7 +136,7 @@ def _loop(kernels: bool, splits: bool, samples: bool, weak: bool, closed: bool) 
                 move = convolved(now, local[0, PHI], channel, middle, spacing, finest, depth, closed)
             elif splits:
                 accuracy = Accuracy(depth, limits[2] * shares[k], finest)
-                move = divided(now, local, c, averages, spacing, closed, accuracy)
+                move = divided(now, local, c, averages, spacing, closed, varying, accuracy)
             if not (move.error < np.inf and move.rounding < max(LEAST_ROUNDING, 1e-3 * most)):
                 answer[0], answer[1], answer[2] = float(low), float(high), move.needed
                 status = RANGE if move.needed > 0.0 and not (move.error < np.inf) else FAILED
@@ -219,9 +220,9 @@ def _loop(kernels: bool, splits: bool, samples: bool, weak: bool, closed: bool) 
 
 def declare_usual() -> None:
     """Declare the loops of all mechanisms but those of samples of an h with kinks, so that they can be compiled beforehand."""
-    for kernels, splits in ((False, True), (True, False), (True, True)):
-        for samples, closed in product_of((False, True), repeat=2):
-            _loop(kernels, splits, samples, False, closed)
+    for samples, closed in ((False, False), (True, False), (True, True)):
+        for kernels, splits, varying in ((True, False, False), *product_of((False, True), (True,), (False, True))):
+            _loop(kernels, splits, varying, samples, False, closed)
 
 
 def advance(
@@ -239,7 +240,7 @@ def advance(
     """
     count, size = len(observed), len(state.values)
     results = Results(np.empty((count, size)), np.empty((count + 1, len(COLUMNS))))
-    known = Constants(AVERAGES if steps.covariances.shape[1] > 1 else WHOLE, *waves(size))
+    known = Constants(AVERAGES if mechanisms.varying else WHOLE, *waves(size))
     done, number = _loop(*mechanisms)(state, grid, steps, first, observed, limits, known, results)
     densities, out = results
     if mechanisms.closed:

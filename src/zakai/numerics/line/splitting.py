@@ -68,7 +68,7 @@ class Filtering(NamedTuple):
 
 @helper
 def divided(
-    now: Array, table: Array, c: Coefficients, averages: Array, spacing: float, closed: bool, accuracy: Accuracy
+    now: Array, table: Array, c: Coefficients, averages: Array, spacing: float, closed: bool, varying: bool, accuracy: Accuracy
 ) -> Transition:
     """Replace a density by that after a split interval, in as many averages and substeps as its error asks for.
 
@@ -82,9 +82,10 @@ def divided(
         averages: the weights of `line/averages.py`.
         spacing: the spacing of the grid.
         closed: whether it goes around the circle.
+        varying: whether the coefficients vary within the interval.
         accuracy: what is asked of the result.
     """
-    size, at, varying, (depth, most, finest) = now.size, highest_of(now), averages.shape[0] > 1, accuracy
+    size, at, (depth, most, finest) = now.size, highest_of(now), accuracy
     begin, phi, drift = now.copy(), np.empty(size), np.empty(size)
     b, first, second = np.empty(size), np.empty(size), np.empty(size)
     magnus, substeps = 0.0, 1.0  # pairs of averages, one after the other, or the mean
@@ -427,9 +428,7 @@ def _convolve(row: Array, taps: Array, padded: Array, to: Array) -> None:
 
 
 @kernel(void(_V, _M, _M, _T, _V, _V, _V, int64[::1]))
-def _along(
-    v: Array, dv: Array, factors: Array, slopes: Array, taps: Array, changes: Array, turned: Array, order: Array
-) -> None:
+def _along(v: Array, dv: Array, factors: Array, slopes: Array, taps: Array, changes: Array, turned: Array, order: Array) -> None:
     """Replace a density and its derivatives (p, N) by those after convolutions and factors.
 
     Args:

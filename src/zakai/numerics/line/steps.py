@@ -59,12 +59,13 @@ OK, FAILED, RANGE, AFTER, TABLE, UNRESOLVED, NARROW, BROAD, GRID, SIZE = range(l
 class Mechanisms(NamedTuple):
     """What the steps of a record may need; only that is compiled.
 
-    `kernels` or `splits` or both; `samples`: samples after the transition; `weak`: their likelihoods have kinks and act in the
-    weak sense; `closed`: grids around the circle.
+    `kernels` or `splits` or both, these with coefficients that are `varying` within an interval; `samples`: samples after the
+    transition; `weak`: their likelihoods have kinks and act in the weak sense; `closed`: grids around the circle.
     """
 
     kernels: bool
     splits: bool
+    varying: bool
     samples: bool
     weak: bool
     closed: bool
