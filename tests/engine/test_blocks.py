@@ -171,7 +171,7 @@ def sines(count, **keys):
 
 def test_a_named_method_is_taken_block_by_block_where_it_holds_only_so():
     model = sines(5)
-    result = zakai.filter(model, record_of(model), "limited-direct", order=3, kernel="power-series")
+    result = zakai.filter(model, record_of(model), "limited-direct", kernel="power-series")
     assert result.method == "blocks: 5 x limited-direct" and "the method asked for holds for each" in result.why
     assert result.mean.shape == (len(TIMES) + 1, 5)
     with pytest.raises(ConditionError, match="benes does not hold: .* nor block by block"):
@@ -181,8 +181,8 @@ def test_a_named_method_is_taken_block_by_block_where_it_holds_only_so():
 def test_an_option_goes_to_the_blocks_whose_method_has_it():
     model = whole("samples")
     record = record_of(model)
-    with pytest.raises(InputError, match='order: 0 must be a whole number from 1, and needs kernel="power-series"'):
-        zakai.filter(model, record, order=0)
+    with pytest.raises(InputError, match='option kernel: "exact" is neither "flow" nor "power-series"'):
+        zakai.filter(model, record, kernel="exact")
     wrong = 'none of kalman-bucy and limited-direct and benes has an option "speed"; the options are .*kernel'
     with pytest.raises(InputError, match=wrong):
         zakai.filter(model, record, speed=3)

@@ -20,13 +20,13 @@ from zakai.numerics.transition import compose
 t = sympy.Symbol("t")
 
 
-def series(G, L, l, Q, p, r, order=None):
+def series(G, L, l, Q, p, r):
     """The transitions of v_t = G:Hess v / 2 - (L x + l).grad v - (x'Q x + p.x + r) v / 2."""
     n = len(l)
     state = [f"x{i}" for i in range(n)]
     model = zakai.Model(state=state, drift=["0"] * n, observation=state)
     blocks = [sympy.sympify(entry).subs(t, model.t) for entry in entries(G, L, l, Q, p, r)]
-    return PowerSeries(model, [*blocks, *blocks[2 * n * n + n :]], order)
+    return PowerSeries(model, [*blocks, *blocks[2 * n * n + n :]])
 
 
 def transitions(found, starts, stops):

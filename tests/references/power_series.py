@@ -7,7 +7,8 @@ import sympy
 
 from zakai.methods.system.jets import Expansion
 from zakai.methods.yau.kernel import transition_of
-from zakai.methods.yau.power import power_series, schroedinger, taylor_data
+from zakai.methods.yau.power import Series, _recursion, _term_sizes, power_series, schroedinger, taylor_data
+from zakai.numerics.series.power_series import value
 
 KEYS = ("G", "L", "l", "Q", "p", "r")
 
@@ -38,8 +39,16 @@ def kernel_of(transition):
     return -0.5 * inverse, B, C, D[..., 0], E[..., 0], s[..., 0, 0] - 0.5 * np.linalg.slogdet(2.0 * np.pi * noise)[1]
 
 
+def cut(z, delta, order):
+    """The series after the power `order`; all terms beyond it are its remainder."""
+    coefficients = _recursion(z)
+    sizes = _term_sizes(z, coefficients, delta, 1)
+    kept = [value(np.stack([series[v] for v in range(order + 1)]), delta) for series in coefficients]
+    return Series(*kept, sum(sizes[order + 1 :], sizes[-1] + sizes[-2]))
+
+
 def single(data, length, order=None):
     """The kernel of one series over an interval, cut after the power `order`, and its remainder."""
     z, delta = schroedinger(data), np.array([length])
-    found = power_series(z, delta, order)
+    found = power_series(z, delta) if order is None else cut(z, delta, order)
     return [np.asarray(field)[0] for field in kernel_of(transition_of(z, found, delta))], found.remainder.item()

@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 
 from zakai.algebra.theorems import limited_direct
-from zakai.errors import InputError
 from zakai.methods._options import one_of, tolerance_of
 from zakai.methods._protocol import Method
 from zakai.methods.grid.yau_yau import METHOD as YAU_YAU
@@ -35,7 +34,6 @@ def prepare(
     *,
     kernel: str = "flow",
     splitting: str = "strang",
-    order: int | None = None,
     tolerance: float | None = None,
 ) -> Any:
     """Return what is prepared for a schedule.
@@ -50,30 +48,25 @@ def prepare(
         splitting: of increments with nonlinear h.  "strang", the default: with one state the equation with y linear between
             observations is solved to the tolerance, with more the observation acts in two halves.  "lie" is the order of the
             papers, the transition with -h'S^-1 h / 2 inside and then exp(h'S^-1 dy).
-        order: power of the length of an interval after which the series is cut, without dividing the interval; by default the
-            first that leaves a remainder below 1e-13.
         tolerance: bound on the error of a step: of the mean in standard deviations and of the log-likelihood; by default 1e-7
             for one state, with substeps for 1e-9.
 
     Raises:
-        InputError: another word, a tolerance that is out of range, or an order that is no whole number from 1.
+        InputError: another word, or a tolerance that is out of range.
         ConditionError: with the series, a singular G, or a coefficient that is not analytic in time.
     """
     one_of("kernel", kernel, ("flow", "power-series"))
     one_of("splitting", splitting, ("strang", "lie"))
-    series = kernel == "power-series"
-    if order is not None and (isinstance(order, bool) or not isinstance(order, int) or order < 1 or not series):
-        raise InputError(f'option order: {order!r} must be a whole number from 1, and needs kernel="power-series"')
     if model.n > 1:
         from zakai.methods.space import direct as space_direct
 
-        options: dict[str, Any] = {"splitting": splitting, "tolerance": tolerance, "kernel": kernel, "order": order}
+        options: dict[str, Any] = {"splitting": splitting, "tolerance": tolerance, "kernel": kernel}
         return space_direct.prepare(model, schedule, theta, **options)
     prepared = line_filter.prepare(model, schedule, theta, tolerance_of(tolerance, 1e-9), in_pieces(model))
     prior = model.prior
     prepared = replace(
         prepared, promised=1e-7 if tolerance is None else prepared.tolerance, generous=256 if model.periodic else 128,
-        yau=yau_line_of(model), lie=splitting == "lie", series=power_series_of(model, order) if series else None,
+        yau=yau_line_of(model), lie=splitting == "lie", series=power_series_of(model) if kernel == "power-series" else None,
         origin=float(prior.mean[0]) if isinstance(prior, GaussianPrior | MixturePrior) else 0.0,
     )  # fmt: skip
     prepared.kernels  # noqa: B018  # which fails where a series does not hold
@@ -92,7 +85,7 @@ METHOD: Method[Any, Any] = replace(
     exactness="exact between observations for every h in the class; increments with y linear between observations, with one "
     "state to the tolerance, with more by a symmetric splitting where h is nonlinear",
     theorem=limited_direct,
-    options={"kernel": "flow", "splitting": "strang", "order": None, "tolerance": None},
+    options={"kernel": "flow", "splitting": "strang", "tolerance": None},
     prepare=prepare,
     variant=variant,
     handles=features.OF_OBSERVATION | {features.INPUTS, features.JUMPS, features.KINKS, features.SINC, features.TABLES},

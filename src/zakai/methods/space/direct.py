@@ -154,7 +154,6 @@ def prepare(
     splitting: str = "strang",
     tolerance: float | None = None,
     kernel: str = "flow",
-    order: int | None = None,
     **_: Any,
 ) -> base.Prepared:
     """Return what is known without data."""
@@ -162,7 +161,7 @@ def prepare(
     bounds = Bounds(EDGE, TAIL, MOST[model.n], (False,) * model.n, band_limited=True)
     theta = np.asarray(theta)
     yau = yau_of(model)
-    series = power_series_of(model, order) if kernel == "power-series" else None
+    series = power_series_of(model) if kernel == "power-series" else None
     lie = splitting == "lie"
     system = system_of(model)
     observations = Observations(model, schedule, system, theta, {} if is_complex(theta) else system.caches(theta)[0])

@@ -25,7 +25,7 @@ from zakai.numerics.series.power_series import apply, dot, value
 from zakai.numerics.transition import Array, Transition, at, compose, identity, symmetric, transposed
 
 TOLERANCE = 1e-13  # remainder above which an interval is divided
-TERMS = 20  # of a series whose order is not given
+TERMS = 20  # of a series
 MOST_PARTS = 1024  # of one interval
 PROBES = 128  # times of an interval at which the Taylor polynomials are compared with the coefficients
 RESOLVED = 1e-10  # difference at these times above which an interval is divided
@@ -38,11 +38,10 @@ class PowerSeries:
     Args:
         model: the Yau system.
         blocks: the entries of L, l, G and of Q, p, r of the potential x'Q x + p.x + r without and with -h'S^-1 h / 2.
-        order: the power after which a series is cut; None for 20 terms and as many parts of an interval as they need.
     """
 
-    def __init__(self, model: Model, blocks: Sequence[sp.Expr], order: int | None):
-        self.n, self.order = model.n, order
+    def __init__(self, model: Model, blocks: Sequence[sp.Expr]):
+        self.n = model.n
         self.steady = not any(sp.sympify(entry, strict=True).has(model.t) for entry in blocks)
         own = 2 * model.n**2 + model.n
         size = (len(blocks) - own) // 2
@@ -79,7 +78,7 @@ class PowerSeries:
             for first in range(0, len(pending), size):
                 rows = pending[first : first + size]
                 found, errors = self._divided(starts[rows], lengths[rows], theta, origin, full, parts)
-                good = np.full(len(rows), self.order is not None) | (errors <= TOLERANCE * parts)
+                good = errors <= TOLERANCE * parts
                 if parts >= MOST_PARTS and not good.all():
                     raise ConditionError(
                         f"the power series leaves a remainder of {errors.max():.1e} on {parts} parts of an interval of length "
@@ -100,10 +99,10 @@ class PowerSeries:
         begins = (starts[:, None] + lengths[:, None] * shares).ravel()
         widths = np.repeat(lengths / parts, len(shares))
         expansion = self._expansions[full]
-        taylor = expansion.taylor(begins, TERMS if self.order is None else self.order + 4, theta)
+        taylor = expansion.taylor(begins, TERMS, theta)
         with np.errstate(all="ignore"):
             z = schroedinger(taylor_data(taylor, origin))
-            series = power_series(z, widths, self.order, parts=len(shares))
+            series = power_series(z, widths, len(shares))
             found = transition_of(z, series, widths)
             mismatch = 0.0 * widths
             if not self.steady:

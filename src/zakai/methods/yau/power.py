@@ -172,18 +172,16 @@ class Series(NamedTuple):
     remainder: Array
 
 
-def power_series(z: Schroedinger, delta: Array, order: int | None = None, parts: int = 1) -> Series:
-    """Return Theorem 3 over intervals of the lengths `delta` (K,), each cut after the power `order`, or after all terms.
+def power_series(z: Schroedinger, delta: Array, parts: int = 1) -> Series:
+    """Return Theorem 3 over intervals of the lengths `delta` (K,).
 
     `parts` consecutive lengths belong to one interval, whose largest terms the remainder is relative to.
     """
     coefficients = _recursion(z)
     sizes = _term_sizes(z, coefficients, delta, parts)
-    kept = len(sizes) if order is None else order + 1
+    A, B, C, D, E, s = (value(np.stack([series[v] for v in range(len(sizes))]), delta) for series in coefficients)
     # Terms that were not computed count as much as the last two.
-    remainder = reduce(operator.add, sizes[kept:], sizes[-1] + sizes[-2])
-    A, B, C, D, E, s = (value(np.stack([series[v] for v in range(kept)]), delta) for series in coefficients)
-    return Series(A, B, C, D, E, s, remainder)
+    return Series(A, B, C, D, E, s, sizes[-1] + sizes[-2])
 
 
 def _term_sizes(z: Schroedinger, coefficients: tuple[Indexed, ...], delta: Array, parts: int) -> Array:

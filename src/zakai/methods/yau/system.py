@@ -101,6 +101,6 @@ def yau_of(model: Model) -> YauSystem:
 
 
 @once_for_a_model
-def power_series_of(model: Model, order: int | None) -> PowerSeries:
+def power_series_of(model: Model) -> PowerSeries:
     """Return the equation of a model as Taylor series in time, made once."""
-    return PowerSeries(model, yau_of(model).blocks, order)
+    return PowerSeries(model, yau_of(model).blocks)
