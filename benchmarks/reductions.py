@@ -18,7 +18,6 @@ from zakai.studies.chen_luo_yau_2017 import STEP, euler_paths
 
 WAYS = {
     "split-merge": {},
-    "nnls": {"reduction": "nnls", "components": 40},
     "algorithm-1, alpha = 0.1": {"reduction": "algorithm-1", "alpha": 0.1},
     "algorithm-1, alpha = 0.01": {"reduction": "algorithm-1", "alpha": 0.01},
     "algorithm-1, alpha = 0.001": {"reduction": "algorithm-1", "alpha": 0.001},

@@ -16,7 +16,7 @@ def test_the_command_writes_what_the_function_returns(zakai, tmp_path):
 
 
 def test_a_method_without_a_smoother_is_refused_before_anything_is_written(zakai, tmp_path):
-    choice = ("--method", "gaussian-sum", "--option", "reduction=nnls")
+    choice = ("--method", "gaussian-sum", "--option", "reduction=algorithm-1")
     answer = zakai("smooth", "model.toml", "record.csv", "-o", "smoothed.nc", *choice)
     assert answer.code != 0 and answer.err.count("\n") == 1 and "no backward pass" in answer.err
     assert not (tmp_path / "smoothed.nc").exists()

@@ -248,8 +248,8 @@ def test_a_state_far_from_the_prior_and_units_of_any_size_keep_their_digits():
 def test_a_method_or_a_form_without_a_backward_pass_is_refused():
     record = zakai.Record([0.1], [[0.1]], "increments")
     line = zakai.load_model("gallery:benes")
-    with pytest.raises(zakai.InputError, match='"nnls" has no backward pass; take "split-merge"'):
-        zakai.smooth(line, record, "gaussian-sum", reduction="nnls")
+    with pytest.raises(zakai.InputError, match='"algorithm-1" has no backward pass; take "split-merge"'):
+        zakai.smooth(line, record, "gaussian-sum", reduction="algorithm-1")
     with pytest.raises(zakai.InputError, match='riccati="euler" has no backward pass'):
         zakai.smooth(line, record, "extended-kalman-bucy", riccati="euler")
 

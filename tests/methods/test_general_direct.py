@@ -425,10 +425,9 @@ def test_an_angle_is_wrapped_and_an_outlier_leaves_numbers():
     assert np.isfinite(result.mean).all() and (result.variance > 0).all() and "tail_depth" in warned(result)
 
 
-@pytest.mark.parametrize("reduction", ["algorithm-1", "nnls"])
-def test_a_reduction_without_error_figures_says_that_it_has_none(reduction):
+def test_a_reduction_without_error_figures_says_that_it_has_none():
     record = spiral_record()
-    result = zakai.filter(spiral(), record, "general-direct", reduction=reduction, components=40)
+    result = zakai.filter(spiral(), record, "general-direct", reduction="algorithm-1", components=40)
     assert "no error figures" in result.warnings[0] and distance(result, on_a_line(record))[0] <= 0.5
 
 

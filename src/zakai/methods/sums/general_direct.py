@@ -32,7 +32,7 @@ TOLERANCE = 1e-3
 # What the transitions and the integrals over time of likelihoods must be known to.
 _KNOWN = 1e-9, 1e-6
 # The ways to keep the sum small, and up to which n.
-_REDUCTIONS: dict[str, float] = {"split-merge": np.inf, "nnls": 2, "algorithm-1": 1}
+_REDUCTIONS: dict[str, float] = {"split-merge": np.inf, "algorithm-1": 1}
 
 
 class State(NamedTuple):
@@ -72,7 +72,7 @@ def prepare(
         theta: The parameters (p,).
         components: The largest number of components; by default according to the directions in which h and phi vary.
         splitting: "strang" or "lie": where the factor of an increment is.
-        reduction: "split-merge", "nnls" or "algorithm-1".
+        reduction: "split-merge" or "algorithm-1".
         tolerance: The loss below which components are not split.
         alpha: The threshold of Algorithm 1.
 

@@ -14,7 +14,7 @@ from zakai.methods.sums.static import Sum
 from zakai.methods.sums.system import Factor
 from zakai.numerics.flow import Transition
 from zakai.numerics.sums.curvature import Curvature, curvature
-from zakai.numerics.sums.fits import fit_dictionary, fit_peaks
+from zakai.numerics.sums.fits import fit_peaks
 from zakai.numerics.sums.mixture import (
     Array,
     Components,
@@ -256,8 +256,6 @@ class Moment:
         static, rounds, done = self.static, 1, 0
         if static.reduction == "algorithm-1":
             return fit_peaks(v, static.alpha, most)
-        if static.reduction == "nnls":
-            return fit_dictionary(v, self.share(v)[0], most)
         while done < rounds:
             share = self.share(v)[0].real
             curved = self.curvature(v)

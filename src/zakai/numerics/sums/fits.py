@@ -1,6 +1,6 @@
-"""Two ways to fit a Gaussian sum again, kept for comparison: the papers' Algorithm 1, and non-negative least squares.
+"""Another way to fit a Gaussian sum again, kept for comparison: the papers' Algorithm 1.
 
-Algorithm 1 fits a Gaussian to each peak of a density, then to the negative peaks of the residual.  A peak below alpha times the
+It fits a Gaussian to each peak of a density, then to the negative peaks of the residual.  A peak below alpha times the
 maximum is not fitted: what lies there is deleted, and a filter cannot get it back.
 """
 
@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from zakai.numerics.sums.mixture import Array, Components, components, shares
+from zakai.numerics.sums.mixture import Components, shares
 
 POINTS = 512
 _REACH = 6.0
@@ -47,39 +47,3 @@ def fit_peaks(sum_: Components, alpha: float, most: int) -> Components:
         fitted.append((np.log(height) + 0.5 * np.log(2 * np.pi * width), place, width, sign))
     weights, places, widths, signs = (np.array(column) for column in zip(*fitted, strict=True))
     return Components(weights, places[:, None], widths[:, None, None], signs.real)
-
-
-def fit_dictionary(sum_: Components, share: Array, most: int, iterations: int = 300) -> Components:
-    """Return non-negative least squares on a grid of at most `most` equal Gaussians; one or two states.
-
-    Minimises the integrated square of the difference by multiplicative steps w <- w b / (A w).  The spacing is a power of
-    2^(1/4), so that the nodes seldom change from step to step.
-    """
-    n = sum_.means.shape[1]
-    count = int(round(most ** (1 / n) - 0.499))
-    used = share.real > 1e-6
-    deviation = np.sqrt(np.diagonal(sum_.covs.real, axis1=1, axis2=2))[used]
-    low = (sum_.means.real[used] - 2.0 * deviation).min(axis=0)
-    high = (sum_.means.real[used] + 2.0 * deviation).max(axis=0)
-    spacing = 2.0 ** (np.ceil(4 * np.log2((high - low) / max(count - 2, 1))) / 4)
-    first = np.round((low + high) / (2 * spacing)) - (count - 1) // 2
-    index = np.stack(np.meshgrid(*[np.arange(count)] * n, indexing="ij"), axis=-1).reshape(-1, n)
-    nodes = (first + index) * spacing
-    cov = np.diag((0.8 * spacing) ** 2)
-
-    def overlaps(means: Array, covs: Array) -> Array:
-        apart = nodes[:, None] - means
-        inner = cov + covs
-        quadratic = np.einsum("kai,aij,kaj->ka", apart, np.linalg.inv(inner), apart)
-        return np.asarray(np.exp(-0.5 * quadratic) / np.sqrt(np.linalg.det(2 * np.pi * inner)))
-
-    wanted = overlaps(sum_.means, sum_.covs) @ shares(sum_)[0]
-    wanted = np.where(wanted.real > 1e-300, wanted, 1e-300)
-    gram = overlaps(nodes, np.broadcast_to(cov, (len(nodes), n, n)))
-    w = wanted * np.prod(spacing)
-    for _ in range(iterations):
-        fit = gram @ w
-        w = w * wanted / np.where(fit.real > 1e-300, fit, 1e-300)
-    w = w / w.sum()
-    kept = w.real > 1e-12
-    return components(np.log(w[kept]), nodes[kept], np.broadcast_to(cov, (int(kept.sum()), n, n)).copy())
