@@ -60,3 +60,21 @@ def test_other_kinds_and_late_rows_are_refused_with_what_to_do(tmp_path):
     late = "the time 0.75 is late by 0.25: the last observation was at 1.0, which is kept; .* checkpoint"
     with pytest.raises(InputError, match=late):
         online.update(0.75, 0.1)
+
+
+@pytest.mark.parametrize("kind", ["increments", "samples"])
+@pytest.mark.parametrize("drift", ["t*x/4", "-x*cos(3*t)", "sin(x - t)"])
+def test_irregular_times_and_gaps_give_the_same_bits_online_where_all_depends_on_time(drift, kind):
+    model = zakai.Model(
+        state=["x"], drift=[drift], diffusion=[["1 + t/5"]], observation=["sin(x)", "cos(x) + t"], observation_kind=kind,
+        observation_noise=[["1 + t/3", "1/4"], ["1/4", "1"]], prior={"kind": "gaussian", "mean": [0.3], "cov": [[0.5]]},
+    )  # fmt: skip
+    rng = np.random.default_rng(3)
+    times = np.cumsum(rng.choice([0.02, 0.02, 0.05, 0.013], 24))
+    values = (0.05 if kind == "increments" else 0.6) * rng.standard_normal((24, 2))
+    values[[5, 6, 11], [0, 1, 0]] = np.nan
+    values[17] = np.nan
+    result, online = zakai.filter(model, zakai.Record(times, values, kind)), zakai.online(model)
+    for k, (time, value) in enumerate(zip(times, values, strict=True), 1):
+        estimate = online.update(time, value)
+        assert estimate.mean.tolist() == result.mean[k].tolist() and estimate.cov[0, 0] == result.variance[k, 0], k
