@@ -5,16 +5,19 @@ from __future__ import annotations
 import logging
 import sys
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager, nullcontext
 from importlib.util import find_spec
 from threading import Lock, Timer
-from typing import Any
+from typing import Any, TypeVar
+
+T = TypeVar("T")
 
 PATIENCE = 1.0  # seconds of work before a bar appears
 FIRST = 5.0  # seconds after which long work is announced
 
 Advance = Callable[[int, int | None], None]
+Progress = Callable[[int, int], None]
 _LOG = logging.getLogger("zakai")
 _LOCK = Lock()  # one bar at a time: work inside of other work has none of its own
 
@@ -57,6 +60,29 @@ def bar(what: str, patience: float = PATIENCE) -> Iterator[Advance | None]:
     finally:
         drawn.close()
         _LOCK.release()
+
+
+@contextmanager
+def counting(what: str, total: int, progress: Progress | None) -> Iterator[Callable[[Iterable[T]], Iterator[T]]]:
+    """Yield a function that passes the items of an iterable on and counts them, in all iterables that it is given.
+
+    Args:
+        what: the words before the bar.
+        total: the number of all items.
+        progress: called with the number of items done and `total`; without it long work has a bar on a terminal.
+    """
+    with bar(what) if progress is None else nullcontext(progress) as advance:
+        done = 0
+
+        def counted(items: Iterable[T]) -> Iterator[T]:
+            nonlocal done
+            for item in items:
+                yield item
+                done += 1
+                if advance is not None:
+                    advance(done, total)
+
+        yield counted
 
 
 class _Bar:

@@ -104,3 +104,18 @@ def test_blocks_and_wrong_calls():
                  lambda: result.predict_observations().sample(0)):  # fmt: skip
         with pytest.raises(InputError):
             call()
+
+
+@pytest.mark.parametrize("gap", [0.5, 6.0, 40.0])
+def test_quantiles_of_two_peaks_leave_their_share_below(gap):
+    weights = np.array([0.3, 0.7])
+    prior = {"kind": "mixture", "weights": weights, "means": [[-gap], [gap]], "covs": [[[0.01]], [[0.01]]]}
+    model = zakai.Model(
+        state=["x"], drift=["0"], diffusion=[["0.001"]], observation=["x"], observation_noise=[["0.01"]],
+        observation_kind="samples", prior=prior,
+    )  # fmt: skip
+    predicted = zakai.filter(model, zakai.Record([0.01], [np.nan], "samples"), "particle", seed=1).predict_observations()
+    draws = predicted.sample(200_000, seed=2)[:, 0, 0]
+    for q in (1e-6, 0.05, 0.25, 0.35, 0.9, 1 - 1e-6):
+        found = predicted.quantile(q)[0, 0]
+        assert abs(np.mean(draws <= found) - q) < 5 * np.sqrt(q * (1 - q) / len(draws)) + 1e-5

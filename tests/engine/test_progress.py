@@ -89,3 +89,10 @@ def test_work_that_fails_leaves_the_terminal_to_the_next_bar(monkeypatch):
     with bar("second", 0.0) as advance:
         advance(1, 3)
     assert "second" in terminal.getvalue()
+
+
+@pytest.mark.parametrize("name", ["predict_observations", "residuals"])
+def test_what_follows_a_filter_says_how_far_it_is(name):
+    result, said = zakai.filter(MODEL, zakai.Record(0.01 * np.arange(1, 41), np.zeros(40))), []
+    getattr(result, name)(progress=lambda done, total: said.append((done, total)))
+    assert said == [(k, 40) for k in range(1, 41)]

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zakai import _display
+from zakai._progress import Progress, counting
 from zakai.diagnostics.predictive import Mixture, PredictiveSums
 from zakai.engine.forecast import future_of, origin_of
 from zakai.engine.loop import CHUNK, Run, segments
@@ -30,6 +31,8 @@ Array = NDArray[Any]
 DRAWS = 20_000  # of a density that is no mixture
 SMALL = 1e-10  # weight of a point, relative to the largest, that is left out
 HALVINGS = 60  # of the bracket of a quantile
+EXTENT = 39.0  # standard deviations beyond which a Gaussian has no probability in double precision
+ROUNDING = 1e-13  # last step of a quantile, in standard deviations of the law
 
 
 class Law(NamedTuple):
@@ -77,31 +80,59 @@ class Law(NamedTuple):
 
     def quantile(self, q: Array) -> Array:
         """Return quantiles (len(q), m), of counts the smallest count with at least this probability."""
-        m = self.means.shape[1]
-        counts = np.array([self.cov is None and name in COUNTS for name in self._families])
-        angles = np.array([self.cov is None and name == "von-mises" for name in self._families])
-        positive = np.array([self.cov is None and name in ("log-normal", "exponential") for name in self._families])
-        found = np.empty((len(q), m))
-        for i, probability in enumerate(q):
-            centre = self.mean()
-            low, high = np.where(angles, -np.pi, centre - 1.0), np.where(angles, np.pi, centre + 1.0)
-            low = np.where(counts, -1.0, np.where(positive, 0.0, low))
-            for _ in range(200):
-                below, above = self.distribution(low) > probability, self.distribution(high) < probability
-                fixed = counts | angles | positive
-                below, above = below & ~fixed, above & ~angles
-                if not (below.any() or above.any()):
-                    break
-                width = high - low
-                low, high = np.where(below, low - 2 * width, low), np.where(above, high + 2 * width, high)
-            high = np.where(counts, np.ceil(high), high)
-            for _ in range(HALVINGS):
-                middle = 0.5 * (low + high)
-                middle = np.where(counts, np.floor(middle), middle)
-                enough = self.distribution(middle) >= probability
-                low, high = np.where(enough, low, middle), np.where(enough, middle, high)
-            found[i] = high
-        return found
+        find = self._bisection if self.cov is None else self._newton
+        return np.stack([find(float(probability)) for probability in q])
+
+    def _newton(self, probability: float) -> Array:
+        """Return the quantiles (m,) of mixtures of Gaussians by Newton's method, with bisection where it converges slowly."""
+        from scipy.special import ndtr, ndtri
+
+        assert self.cov is not None
+        deviations = np.sqrt(np.diagonal(self.cov, axis1=-2, axis2=-1))
+        low = (self.means - EXTENT * deviations).min(axis=0)
+        high = (self.means + EXTENT * deviations).max(axis=0)
+        mean = self.weights @ self.means
+        scale = np.sqrt(self.weights @ ((self.means - mean) ** 2 + deviations**2))
+        z, step = np.clip(mean + ndtri(probability) * scale, low, high), high - low
+        for _ in range(2 * HALVINGS):
+            scores = (z - self.means) / deviations
+            excess = self.weights @ ndtr(scores) - probability
+            slope = self.weights @ (np.exp(-0.5 * scores**2) / deviations) / np.sqrt(2 * np.pi)
+            low, high = np.where(excess < 0, z, low), np.where(excess < 0, high, z)
+            with np.errstate(all="ignore"):
+                proposed = z - excess / slope
+            converges = (low < proposed) & (proposed < high) & (np.abs(proposed - z) < 0.5 * np.abs(step))
+            proposed = np.where(converges, proposed, 0.5 * (low + high))
+            step, z = proposed - z, proposed
+            if (np.abs(step) <= ROUNDING * scale).all():
+                break
+        return np.asarray(self.shift + self.scale * z)
+
+    def _bisection(self, probability: float) -> Array:
+        """Return the quantiles (m,) of other laws."""
+        counts = np.array([name in COUNTS for name in self._families])
+        angles = np.array([name == "von-mises" for name in self._families])
+        positive = np.array([name in ("log-normal", "exponential") for name in self._families])
+        centre = self.mean()
+        low, high = np.where(angles, -np.pi, centre - 1.0), np.where(angles, np.pi, centre + 1.0)
+        low = np.where(counts, -1.0, np.where(positive, 0.0, low))
+        for _ in range(200):
+            below, above = self.distribution(low) > probability, self.distribution(high) < probability
+            fixed = counts | angles | positive
+            below, above = below & ~fixed, above & ~angles
+            if not (below.any() or above.any()):
+                break
+            width = high - low
+            low, high = np.where(below, low - 2 * width, low), np.where(above, high + 2 * width, high)
+        high = np.where(counts, np.ceil(high), high)
+        for _ in range(HALVINGS):
+            if np.where(counts, high - low <= 1.0, False).all():
+                break
+            middle = 0.5 * (low + high)
+            middle = np.where(counts, np.floor(middle), middle)
+            enough = self.distribution(middle) >= probability
+            low, high = np.where(enough, low, middle), np.where(enough, middle, high)
+        return high
 
     def sample(self, rng: np.random.Generator, count: int) -> Array:
         """Return draws (count, m)."""
@@ -164,21 +195,24 @@ class PredictedObservations:
         return found
 
 
-def predict_observations(result: FilterResult, times: Any = None, inputs: Inputs | None = None) -> PredictedObservations:
+def predict_observations(
+    result: FilterResult, times: Any = None, inputs: Inputs | None = None, progress: Progress | None = None
+) -> PredictedObservations:
     """Return the laws of observations; see `FilterResult.predict_observations`."""
     plan, states, record = origin_of(result, "predict_observations")
     model = plan.model
     if model.observation_kind == "samples" and model.log_density is not None:
         raise InputError(f"{model.source}: predict_observations: observation_log_density gives no law that can be predicted")
     ahead = record if times is None else future_of(result, times, inputs, "predict_observations")
+    observed = [parts for parts in zip(plan.runs(ahead, "moments"), plan.blocks, states, strict=True) if parts[1].observations]
+    last = None if times is None else float(record.times[-1])
     laws = []
-    for run, block, state in zip(plan.runs(ahead, "moments"), plan.blocks, states, strict=True):
-        if not block.observations:
-            continue
-        last = None if times is None else float(record.times[-1])
-        if last is not None:
-            run.state, run.schedule.starts[0] = state, last
-        laws.append((tuple(block.observations), tuple(_laws(run, _path_before(run, record, block.observations, last), last))))
+    with counting("predicting observations", len(observed) * len(ahead), progress) as counted:
+        for run, block, state in observed:
+            if last is not None:
+                run.state, run.schedule.starts[0] = state, last
+            path = _path_before(run, record, block.observations, last)
+            laws.append((tuple(block.observations), tuple(counted(_laws(run, path, last)))))
     mean = np.empty((len(ahead), model.m))
     for columns, own in laws:
         mean[:, list(columns)] = [law.mean() for law in own]

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from zakai._progress import Progress, counting
 from zakai.diagnostics.predictive import Pair, PredictiveSums
 from zakai.diagnostics.predictive_evidence import PredictiveEvidence
 from zakai.engine.forecast import origin_of
@@ -30,19 +31,19 @@ Array = NDArray[Any]
 LONGEST = 0.2  # variance that the state adds to an increment within its interval, in units of that of its noise
 
 
-def residuals(result: FilterResult, seed: int = 0, first: int = 0) -> Array:
+def residuals(result: FilterResult, seed: int = 0, first: int = 0, progress: Progress | None = None) -> Array:
     """Return the probability integral transforms (K, m); see `FilterResult.residuals`.  Rows before `first` are left out."""
     plan, _, record = origin_of(result, "residuals")
     draws = np.random.default_rng(seed).uniform(size=record.values.shape)
     found: Array = np.full(draws.shape, np.nan)
     error, share = 0.0, 0.0
-    for run, block in zip(plan.runs(record, "moments"), plan.blocks, strict=True):
-        columns = list(block.observations)
-        if not columns:
-            continue
-        for k, (below, upto), *errors in _laws(run, first):
-            found[k, columns] = below + draws[k, columns] * (upto - below)
-            error, share = max(error, errors[0]), max(share, errors[1])
+    observed = [parts for parts in zip(plan.runs(record, "moments"), plan.blocks, strict=True) if parts[1].observations]
+    with counting("residuals", len(observed) * (len(record) - first), progress) as counted:
+        for run, block in observed:
+            columns = list(block.observations)
+            for k, (below, upto), *errors in counted(_laws(run, first)):
+                found[k, columns] = below + draws[k, columns] * (upto - below)
+                error, share = max(error, errors[0]), max(share, errors[1])
     if error > MASS_ERROR:
         warnings.warn(
             f"residuals: the mass of a predictive law differs from 1 by {error:.2g} nats: the steps are too long for increments, "

@@ -10,7 +10,7 @@ from contextlib import nullcontext
 from threading import Event, Lock, Thread
 from typing import Any
 
-from zakai._progress import FIRST, bar
+from zakai._progress import FIRST, Progress, bar
 from zakai.algebra.choice import faster
 from zakai.engine.loop import Run
 from zakai.numerics.compiled import working_time
@@ -23,7 +23,6 @@ WATCHED = 1.0  # seconds between checks whether a run takes longer than was anno
 SURE = 0.5  # seconds after which the rest can be estimated
 
 _LOG = logging.getLogger("zakai")
-Progress = Callable[[int, int], None]
 
 
 def filter_all(runs: Sequence[Run], progress: Progress | None, blocks: float = 1.0) -> None:

@@ -8,8 +8,8 @@ from typing import Any, overload
 
 import numpy as np
 
-from zakai._progress import announced
-from zakai.engine.batch import Progress, filter_all
+from zakai._progress import Progress, announced
+from zakai.engine.batch import filter_all
 from zakai.engine.loop import KEPT_BYTES
 from zakai.engine.plan import Plan, plan_of
 from zakai.engine.results import FilterResult

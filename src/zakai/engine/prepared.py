@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from zakai import _display
-from zakai.engine.batch import Progress
+from zakai._progress import Progress
 from zakai.engine.driver import check_model, check_noise, check_records, filter_planned, with_inputs
 from zakai.engine.plan import plan_of
 from zakai.engine.results import FilterResult

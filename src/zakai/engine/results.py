@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from zakai import _display
+from zakai._progress import Progress
 from zakai.algebra.conditions import Condition
 from zakai.densities import Density
 from zakai.engine.forecast import forecast, origin_of
@@ -257,7 +258,9 @@ class FilterResult:
         """
         return forecast(self, times, inputs)
 
-    def predict_observations(self, times: Any = None, inputs: Inputs | None = None) -> PredictedObservations:
+    def predict_observations(
+        self, times: Any = None, inputs: Inputs | None = None, progress: Progress | None = None
+    ) -> PredictedObservations:
         """Return the laws of the observations before they are made.
 
             p(z_k | all rows before k), or p(z at a later time | all rows)
@@ -265,6 +268,7 @@ class FilterResult:
         Args:
             times: later times; by default those of the record, each given the rows before it.
             inputs: as for `forecast`.
+            progress: called with the number of laws done and their total; without it long work has a bar on a terminal.
 
         Returns:
             `mean` (K, m), `quantile(q)` and `sample(count, seed)` of values of the model's `observation_kind`.
@@ -279,9 +283,9 @@ class FilterResult:
         """
         from zakai.diagnostics.observed_ahead import predict_observations
 
-        return predict_observations(self, times, inputs)
+        return predict_observations(self, times, inputs, progress)
 
-    def residuals(self, seed: int = 0) -> np.ndarray:
+    def residuals(self, seed: int = 0, progress: Progress | None = None) -> np.ndarray:
         """Return the probability integral transforms (K, m) of the observations.
 
             u_kj = P(Z_kj <= z_kj | z_k1, ..., z_k(j-1), all rows before k)
@@ -291,6 +295,7 @@ class FilterResult:
 
         Args:
             seed: of the draws for counts.
+            progress: called with the number of observations done and K; without it long work has a bar on a terminal.
 
         Raises:
             InputError: a result that was read from a file, or a law without conditional laws of its coordinates.
@@ -305,7 +310,7 @@ class FilterResult:
         """
         from zakai.diagnostics.residuals import residuals
 
-        return residuals(self, seed)
+        return residuals(self, seed, progress=progress)
 
     def report(self, path: str | os.PathLike[str], truth: Any = None) -> None:
         """Write an HTML report of the result: one file that needs no network.

@@ -14,11 +14,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from zakai import _registry
-from zakai._progress import announced
+from zakai._progress import Progress, announced
 from zakai.algebra.conditions import all_hold
 from zakai.algebra.theorems import conditions_of
 from zakai.densities import Density
-from zakai.engine.batch import Progress, filter_all, smooth_all
+from zakai.engine.batch import filter_all, smooth_all
 from zakai.engine.driver import check_noise, check_records, with_inputs
 from zakai.engine.loop import CHUNK, KEPT_BYTES, Run, advance, joined, size_of
 from zakai.engine.paths import sample_paths

@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
-from zakai._progress import bar
-from zakai.engine.batch import LONG, Progress
+from zakai._progress import Progress, bar
+from zakai.engine.batch import LONG
 from zakai.engine.driver import with_inputs
 from zakai.engine.likelihood import LogLikelihood, chosen_parameters
 from zakai.errors import InputError

@@ -46,7 +46,7 @@ def forecast(session: Session, request: Mapping[str, Any], report: Report) -> An
     return summary(found), {}
 
 
-def _tail(held: Held) -> tuple[Any, int]:
+def _tail(held: Held, report: Report) -> tuple[Any, int]:
     """Return a result of the last rows of a record, begun with the density before them, and the number of its first row."""
     from zakai.engine.driver import filter as run_filter
 
@@ -56,14 +56,14 @@ def _tail(held: Held) -> tuple[Any, int]:
         return result, 0
     later = result.model.with_prior(result.density(first), start=float(result.times[first]))
     method, options = ("auto", {}) if result.origin is None else result.origin[0].request
-    return run_filter(later, rows_of(record, first, len(record)), method, keep="moments", **options), first
+    return run_filter(later, rows_of(record, first, len(record)), method, keep="moments", progress=report, **options), first
 
 
 def predicted(session: Session, request: Mapping[str, Any], report: Report) -> Answer:
     """Return each observation with its mean and its 95% band one step ahead, of the last rows of a record."""
     held = session.held(request)
-    result, first = _tail(held)
-    laws = result.predict_observations()
+    result, first = _tail(held, report)
+    laws = result.predict_observations(progress=report)
     low, high = laws.quantile(LEVELS)
     record = result.record
     # The values of increments grow with their interval, and what is seen of them is their rate.
@@ -85,8 +85,8 @@ def residuals(session: Session, request: Mapping[str, Any], report: Report) -> A
 
     from zakai.report.calibration import calibration_of
 
-    result, first = _tail(session.held(request))
-    u = result.residuals()
+    result, first = _tail(session.held(request), report)
+    u = result.residuals(progress=report)
     times = np.asarray(result.times, float)[1:]
     found, arrays = [], {}
     names = result.model.observation_names if result.model is not None else [f"y{j + 1}" for j in range(u.shape[1])]

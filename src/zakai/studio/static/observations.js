@@ -18,7 +18,7 @@ class Lazy {
     this.seen = studio.summary;
     this.panel.replaceChildren(h("p", { class: "small" }, "Computing the laws of the observations …"));
     try {
-      const found = await studio.ask(this.what, { name: "main" }, { quiet: true, work: true });
+      const found = await studio.ask(this.what, { name: "main" }, { quiet: true, work: true, progress: (done, total) => studio.progressed(done, total) });
       if (found) this.draw(found); else this.seen = null;
     } catch (error) {
       this.panel.replaceChildren(h("p", { class: error.cancelled ? "small" : "fault" }, error.cancelled ? "Cancelled; press Run to compute again." : error.message));
