@@ -27,7 +27,8 @@ def fake_model(state=("x",), periodic=(), kind="increments", name="A random walk
         process_noise=sympy.ImmutableMatrix(sympy.eye(n)) * (1 + t**2 / 9),
         observation=sympy.ImmutableMatrix(observation),
         observation_noise=sympy.ImmutableMatrix(sympy.eye(m)) * sympy.Rational(1, 10),
-        observation_kind=kind, start=0.0,
+        observation_kind=kind, start=0.0, observation_family=("gaussian",) * m, log_density=None, domain={},
+        cross_noise=sympy.zeros(n, m),
         periodic=tuple(periodic), functions=(), prior=prior,
         text='name = "A random walk"\nstate = ["x"]\n', source="fake",
     )  # fmt: skip

@@ -155,3 +155,31 @@ def test_the_equations_name_the_kind_of_observation_and_keep_long_decimals():
     result.model.drift = sympy.ImmutableMatrix([sympy.Rational("0.12345") * result.model.x[0]])
     text = equations(result.model)
     assert "samples z" in text and "<mn>0.12345</mn>" in text
+
+
+WAITING = {"state": ["x"], "drift": ["-x"], "prior": {"kind": "gaussian", "mean": [0], "cov": [[1]]}}
+LAWS = {
+    "z(tk)=x+r": {"observation": ["x"]},
+    "logz(tk)=x+r": {"observation": ["x"], "observation_family": "log-normal"},
+    "r∼t(0,S,degrees of freedom=4),S=1": {"observation": ["x"], "observation_family": "student-t", "degrees_of_freedom": 4},
+    "z(tk)∼poisson(x2)": {"observation": ["x**2"], "observation_family": "poisson"},
+    "z(tk)∼von-mises(x,concentration=3)": {"observation": ["x"], "observation_family": "von-mises", "concentration": 3},
+    "logp(z | x)=−|x−z|": {"observation_log_density": "-abs(z - x)", "observed": ["z"]},
+    "x∈[0,3], reflecting ends": {
+        "observation": ["x"], "domain": {"x": {"lower": 0, "upper": 3, "boundary": "reflecting"}},
+        "prior": {"kind": "density", "log_density": "-x**2"},
+    },
+    "x∈(0,∞), natural ends": {
+        "observation": ["x"], "domain": {"x": {"lower": 0}}, "prior": {"kind": "density", "log_density": "-x**2"},
+    },
+    "z(tk)=max(x,0)+atan2(x,t)+r": {"observation": ["max(x, 0) + atan2(x, t)"]},
+    "z(tk)=r+ε": {"state": ["r"], "drift": ["-r"], "observation": ["r"]},
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("law", LAWS)
+def test_the_equations_show_the_law_of_the_observations_and_the_domain(law: str):
+    text = equations(zakai.Model(**{**WAITING, "observation_kind": "samples", **LAWS[law]}))
+    said = re.sub(r"<[^>]+>", "", text)
+    assert law in said
+    assert ("Observation noise" in said) == (not re.match(r"z.*∼|logp", law))

@@ -12,6 +12,11 @@ _LARGEST_MATRIX = 12
 _LARGEST_DENOMINATOR = 1000
 _SPACE = '<mspace width="0.17em"/>'
 _NORMAL = '<mi mathvariant="script">N</mi>'
+_WITH_NOISE = ("gaussian", "student-t", "log-normal")  # z or log z = h + r; of other families h is the parameter of their law
+_LAWS = {
+    "poisson": None, "bernoulli": None, "von-mises": "concentration", "binomial": "trials", "negative-binomial": "dispersion",
+    "exponential": None,
+}  # fmt: skip
 
 
 def equations(model: Any) -> str:
@@ -25,8 +30,9 @@ def _state(model: Any) -> list[str]:
     rows = []
     for i, symbol in enumerate(model.x):
         terms = [(model.drift[i, 0], [_differential(model.t)])]
+        letter = _letter(model, "v")
         terms += [
-            (entry, [_differential(_indexed("v", j, noises))]) for (_, j), entry in sorted(model.diffusion.row(i).todok().items())
+            (entry, [_differential(_indexed(letter, j, noises))]) for (_, j), entry in sorted(model.diffusion.row(i).todok().items())
         ]
         rows.append(_row(_differential(symbol), _operator("="), *_sum(terms)))
     said = "State" + (
@@ -34,53 +40,91 @@ def _state(model: Any) -> list[str]:
         if model.periodic
         else ""
     )
-    return [_words(said), _block(rows), *_covariance("Process noise", "v", "Q", model.process_noise, model)]
+    ends = [_row(_mathml(one), _operator("∈"), *_interval(model.domain[one.name])) for one in model.x if one.name in model.domain]
+    rows += ends
+    return [_words(said), _block(rows), *_covariance("Process noise", _letter(model, "v"), "Q", model.process_noise, model)]
+
+
+def _interval(interval: Any) -> list[str]:
+    low, high = ("[", "]") if interval.reflecting else ("(", ")")
+    ends = [f"<mn>{_short(end)}</mn>".replace("inf", "∞") for end in (interval.lower, interval.upper)]
+    said = f"<mtext>, {'reflecting' if interval.reflecting else 'natural'} ends</mtext>"
+    return [_operator(low), ends[0], _operator(","), ends[1], _operator(high), said]
 
 
 def _observation(model: Any) -> list[str]:
-    rows = []
     samples = model.observation_kind == "samples"
-    for j in range(model.m):
-        if samples:
-            time = "<msub><mi>t</mi><mi>k</mi></msub>"
-            left = _row(_indexed("z", j, model.m), _operator("("), time, _operator(")"))
-            right = [*_sum([(model.observation[j, 0], [])]), _operator("+"), _indexed("r", j, model.m)]
-        else:
-            left = _differential(_indexed("y", j, model.m))
-            terms = [
-                (model.observation[j, 0], [_differential(model.t)]),
-                (sympy.Integer(1), [_differential(_indexed("w", j, model.m))]),
-            ]
-            right = _sum(terms)
-        rows.append(_row(left, _operator("="), *right))
     said = {
         "increments": "Observation: the record holds the increments of y over each interval",
         "path": "Observation: the record holds the path y itself",
         "rates": "Observation: the record holds the increments of y divided by the length of the interval",
         "samples": "Observation: the record holds samples z at the times t<sub>k</sub>; h is taken there",
     }[model.observation_kind]
-    name = "r" if samples else "w"
-    return [
-        _words(said),
-        _block(rows),
-        *_covariance("Observation noise", name, "S", model.observation_noise, model),
-    ]
+    if model.log_density is not None:
+        names = ", ".join(escape(str(symbol)) for symbol in model.z)
+        law = [_operator("log"), "<mi>p</mi>", _operator("("), f"<mtext>{names} | x</mtext>", _operator(")"), _operator("=")]
+        return [_words(said), _block([_row(*law, _mathml(model.log_density))])]
+    noisy = [j for j, family in enumerate(model.observation_family) if not samples or family in _WITH_NOISE]
+    parts = [_words(said), _block([_sample(model, j) if samples else _increment(model, j) for j in range(model.m)])]
+    if noisy:
+        letter = _letter(model, "r" if samples else "w")
+        parts += _covariance("Observation noise", letter, "S", model.observation_noise, model)
+    if not model.cross_noise.is_zero_matrix:
+        parts += _covariance("Noise of state and observation", _letter(model, "v"), "C", model.cross_noise, model)
+    return parts
+
+
+def _sample(model: Any, j: int) -> str:
+    time = "<msub><mi>t</mi><mi>k</mi></msub>"
+    left = _row(_indexed("z", j, model.m), _operator("("), time, _operator(")"))
+    h = _sum([(model.observation[j, 0], [])])
+    family = model.observation_family[j]
+    if family in _WITH_NOISE:
+        left = _row(_operator("log"), left) if family == "log-normal" else left
+        return _row(left, _operator("="), *h, _operator("+"), _indexed(_letter(model, "r"), j, model.m))
+    key = _LAWS[family]
+    parameter = [] if key is None else [_operator(","), f"<mtext>{key}</mtext>", _operator("="), _feature(model, key)]
+    law = f"<mtext>{family}</mtext>"
+    return _row(left, _operator("∼"), law, _operator("("), *h, *parameter, _operator(")"))
+
+
+def _feature(model: Any, key: str) -> str:
+    """The value of a key of the model file: a number, or the text of a formula."""
+    return f"<mtext>{escape(str(model.keys_of_features[key]))}</mtext>"
+
+
+def _increment(model: Any, j: int) -> str:
+    noise = (sympy.Integer(1), [_differential(_indexed(_letter(model, "w"), j, model.m))])
+    terms = [(model.observation[j, 0], [_differential(model.t)]), noise]
+    return _row(_differential(_indexed("y", j, model.m)), _operator("="), *_sum(terms))
 
 
 def _covariance(said: str, noise: str, letter: str, matrix: Any, model: Any) -> list[str]:
-    size = matrix.shape[0]
     value = []
-    if size <= _LARGEST_MATRIX:
-        value = [_operator(","), f"<mi>{letter}</mi>", _operator("="), _mathml(matrix if size > 1 else matrix[0, 0])]
-    if noise == "r":
-        law = _row(f"<mi>{noise}</mi>", _operator("∼"), _NORMAL, _operator("("), "<mn>0</mn>", _operator(","))
-        return [_words(said), _block([_row(law, f"<mi>{letter}</mi>", _operator(")"), *value)])]
-    step = _differential(f"<mi>{noise}</mi>")
-    square = _row("<mi>E</mi>", _operator("["), step, f"<msup>{step}<mi>⊤</mi></msup>", _operator("]"))
+    if max(matrix.shape) <= _LARGEST_MATRIX:
+        value = [_operator(","), f"<mi>{letter}</mi>", _operator("="), _mathml(matrix if max(matrix.shape) > 1 else matrix[0, 0])]
+    if letter == "S" and model.observation_kind == "samples":
+        family, degrees = _NORMAL, []
+        if "student-t" in model.observation_family:
+            known = [_operator(","), "<mtext>degrees of freedom</mtext>", _operator("=")]
+            family, degrees = "<mi>t</mi>", [*known, _feature(model, "degrees_of_freedom")]
+        law = [f"<mi>{noise}</mi>", _operator("∼"), family, _operator("("), "<mn>0</mn>", _operator(","), f"<mi>{letter}</mi>"]
+        return [_words(said), _block([_row(*law, *degrees, _operator(")"), *value)])]
+    first = _differential(f"<mi>{noise}</mi>")
+    second = _differential(f"<mi>{_letter(model, 'w')}</mi>") if letter == "C" else first
+    product = _row("<mi>E</mi>", _operator("["), first, f"<msup>{second}<mi>⊤</mi></msup>", _operator("]"))
     return [
         _words(said),
-        _block([_row(square, _operator("="), f"<mi>{letter}</mi>", _differential(model.t), *value)]),
+        _block([_row(product, _operator("="), f"<mi>{letter}</mi>", _differential(model.t), *value)]),
     ]
+
+
+def _letter(model: Any, usual: str) -> str:
+    """Return the letter of a noise: the usual one, or a Greek one where the model has a name like it."""
+    names = {symbol.name for symbol in (*model.x, *model.parameter_symbols)} | set(getattr(model, "inputs", ()))
+    choices = {"v": ("v", "β", "ξ"), "w": ("w", "η", "ζ"), "r": ("r", "ε", "ρ")}[usual]
+    greek = {"β": "beta", "ξ": "xi", "η": "eta", "ζ": "zeta", "ε": "epsilon", "ρ": "rho"}
+    return next(letter for letter in choices if not {letter, greek.get(letter)} & names or letter == choices[-1])
 
 
 def _prior(model: Any) -> list[str]:
@@ -149,6 +193,11 @@ class _Printer(MathMLPresentationPrinter):
         number = self.dom.createElement("mn")
         number.appendChild(self.dom.createTextNode(_short(expression, 10)))
         return number
+
+    def mathml_tag(self, e: Any) -> str:
+        """Return the name of a function, as in a model file where that differs."""
+        name = str(super().mathml_tag(e))
+        return {"maximum": "max", "minimum": "min"}.get(name, "atan2" if isinstance(e, sympy.atan2) else name)
 
 
 def _mathml(expression: Any) -> str:

@@ -16,7 +16,7 @@ LEVELS = (0.025, 0.975)
 PREDICTED = 1_000  # rows at the end of a record whose laws are computed
 BINS = 10
 MOST_PROFILE = 25  # values of a parameter in a profile
-SPAN = 3.0  # standard errors to each side
+NARROWED, SEEN = 4, 6.0  # times that a profile is computed at most, and the fall of the log-likelihood that it shows
 
 
 def smooth(session: Session, request: Mapping[str, Any], report: Report) -> Answer:
@@ -159,7 +159,7 @@ def fit(session: Session, request: Mapping[str, Any], report: Report) -> Answer:
 
 
 def profile(session: Session, request: Mapping[str, Any], report: Report) -> Answer:
-    """Return the log-likelihood as a function of one parameter, the others as they are."""
+    """Return the log-likelihood as a function of one parameter, the others as they are, around its maximum in an interval."""
     from zakai.engine.driver import filter as run_filter
 
     model = session.model(request)
@@ -170,17 +170,28 @@ def profile(session: Session, request: Mapping[str, Any], report: Report) -> Ans
     if not high > low:
         raise InputError(f"profile: {high:g} must be greater than {low:g}")
     method, options = method_of(request)
-    values, heights = np.linspace(low, high, count), []
-    for done, value in enumerate(values):
+    done = 0
+
+    def height(value: float) -> float:
+        nonlocal done
+        done += 1
+        report(done, NARROWED * count)
         try:
-            there = model.with_parameters(**{name: float(value)})
-            heights.append(run_filter(there, found.record, method, keep="moments", **options).log_likelihood)
+            there = model.with_parameters(**{name: value})
+            return float(run_filter(there, found.record, method, keep="moments", **options).log_likelihood)
         except ZakaiError:  # such as a noise that is not positive there
-            heights.append(float("nan"))
-        report(done + 1, count)
+            return float("nan")
+
+    for _ in range(NARROWED):
+        values = np.linspace(low, high, count)
+        heights = np.array([height(float(value)) for value in values])
+        high_enough = np.flatnonzero(heights >= np.nanmax(heights, initial=-np.inf) - SEEN)
+        if len(high_enough) == 0 or len(high_enough) >= count // 2:
+            break
+        low, high = values[max(0, high_enough[0] - 1)], values[min(count - 1, high_enough[-1] + 1)]
     if not np.isfinite(heights).any():
         raise InputError(f"profile: there is no log-likelihood for {name} from {low:g} to {high:g}; take other ends")
-    return {"parameter": name}, {"values": values, "log_likelihood": np.array(heights)}
+    return {"parameter": name}, {"values": values, "log_likelihood": heights}
 
 
 def _number(request: Mapping[str, Any], key: str) -> float:

@@ -39,7 +39,8 @@ def given(model: Model, request: Mapping[str, Any], folder: Path) -> Given:
 
     Args:
         model: the system.
-        request: `{"kind": "simulate", "until", "step", "seed", "inputs"}` or
+        request: `{"kind": "simulate", "until", "step", "seed", "inputs", "from"}`, the last the text of another model that
+            simulates the record, or
             `{"kind": "file", "file", "columns", "inputs", "unit", "origin", "truth": {"file", "name"}}`.
         folder: where the files are that were given to the studio.
 
@@ -62,6 +63,23 @@ def given(model: Model, request: Mapping[str, Any], folder: Path) -> Given:
         inputs = Inputs(np.array([model.start]), np.array([row]))
     truth, record = simulate(model, times, seed, inputs=inputs)
     return Given(record, truth, "simulated")
+
+
+def simulated_by(source: Model, found: Given, model: Model) -> Given:
+    """Return the record that `source` has simulated for another model.
+
+    Raises:
+        InputError: the models have other observations or inputs.
+    """
+    for what, own, other in (
+        ("observation_kind", source.observation_kind, model.observation_kind),
+        ("the number of observations", source.m, model.m),
+        ("inputs", source.inputs, model.inputs),
+    ):
+        if own != other:
+            raise InputError(f"the record that is kept was simulated by a model with other {what}; press Simulate again")
+    found.record.check(model)
+    return found if source.state == model.state else found._replace(truth=None)
 
 
 def _of_file(model: Model, request: Mapping[str, Any], folder: Path) -> Given:

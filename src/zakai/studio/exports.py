@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from zakai.errors import InputError
+from zakai.models.files import read_keys
 from zakai.records.writing import write_table
 from zakai.studio.running import method_of
 from zakai.studio.session import Answer, Held, Report, Session
@@ -23,7 +24,7 @@ def export(session: Session, request: Mapping[str, Any], report: Report) -> Answ
     """Return a file: its name, its type, and its bytes."""
     what = str(request.get("what"))
     makers: dict[str, Callable[..., bytes]] = {
-        "model.toml": lambda: session.model(request).text.encode(),
+        "model.toml": lambda: _text(session.model(request), request).encode(),
         "record.csv": lambda: _record(session.model(request), session.given(session.model(request), request)),
         "result.nc": lambda: _saved(session.held(request), "result.nc"),
         "result.csv": lambda: _saved(session.held(request), "result.csv"),
@@ -72,7 +73,7 @@ def script(session: Session, request: Mapping[str, Any]) -> str:
     found = session.given(model, request)
     wanted, record = request["data"], found.record
     method, options = method_of(request)
-    text = request["text"]
+    text = _text(model, request)
     lines = [
         f'"""{_one_line(model.name or "A model")}: filtered as in zakai studio."""',
         "",
@@ -87,10 +88,12 @@ def script(session: Session, request: Mapping[str, Any]) -> str:
         "",
         "model = zakai.Model(**tomllib.loads(MODEL, parse_float=Decimal))",
     ]
-    if wanted.get("kind") != "file":
+    if _is_simulated(request):
         lines += _simulated(model, wanted, record)
     elif record.values.size + record.times.size <= EMBEDDED and record.clock is None:
         lines += _embedded(model, record)
+    elif wanted.get("kind") != "file":
+        lines.append('record = zakai.read_record("record.csv", model)  # the record among the exports')
     else:
         lines += _from_file(wanted, found.name)
     arguments = "".join(f", {key}={value!r}" for key, value in options.items())
@@ -105,6 +108,18 @@ def script(session: Session, request: Mapping[str, Any]) -> str:
         'result.save("result.nc")',
     ]
     return "\n".join(lines) + "\n"
+
+
+def _is_simulated(request: Mapping[str, Any]) -> bool:
+    """Return whether the record is simulated by the model of the request, not by another one or given as a file."""
+    wanted = request["data"]
+    return bool(wanted.get("kind") != "file" and wanted.get("from") in (None, request["text"]))
+
+
+def _text(model: Any, request: Mapping[str, Any]) -> str:
+    """Return the text of the page, or where the tables are in files a text that holds them."""
+    files = any("file" in table for table in (read_keys(request["text"]).get("tables") or {}).values())
+    return str(model.text if files else request["text"])
 
 
 def _simulated(model: Any, wanted: Mapping[str, Any], record: Any) -> list[str]:
@@ -158,7 +173,7 @@ def shell(session: Session, request: Mapping[str, Any], report: Report) -> Answe
     extra = "" if method == "auto" else f" --method {method}"
     extra += "".join(f" --option {key}={value}" for key, value in options.items())
     lines = []
-    if wanted.get("kind") == "file":
+    if not _is_simulated(request):
         extra += f" --unit {wanted['unit']}" if wanted.get("unit") else ""
     else:
         until, step, seed = wanted.get("until"), wanted.get("step"), wanted.get("seed", 0)

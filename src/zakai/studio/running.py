@@ -27,6 +27,13 @@ def run(session: Session, request: Mapping[str, Any], report: Report) -> Answer:
     return summary(held), {}
 
 
+def keep(session: Session, request: Mapping[str, Any], report: Report) -> Answer:
+    """Keep a result under a further name."""
+    held = session.held(request, "of")
+    session.keep(str(request.get("name")), held)
+    return summary(held), {}
+
+
 def method_of(request: Mapping[str, Any]) -> tuple[str, dict[str, Any]]:
     """Return the method that a request names, and its options: numbers, true, false and texts."""
     options: dict[str, Any] = {}
@@ -109,4 +116,4 @@ def rows_of(record: Record, start: int, stop: int) -> Record:
     return Record(record.times[start:stop], record.values[start:stop], record.kind, record.inputs, **clock)
 
 
-TASKS: dict[str, Callable[..., Answer]] = {"run": run, "picture": picture, "joint": joint}
+TASKS: dict[str, Callable[..., Answer]] = {"run": run, "keep": keep, "picture": picture, "joint": joint}

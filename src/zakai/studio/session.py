@@ -22,7 +22,7 @@ from zakai.studio import data
 
 Report = Callable[[int, int | None], None]  # receives what is done of how much
 Answer = tuple[dict[str, Any], dict[str, np.ndarray]]
-KEPT_MODELS, KEPT_RECORDS, KEPT_RESULTS = 8, 3, 6
+KEPT_MODELS, KEPT_RECORDS, KEPT_RESULTS = 8, 3, 8
 MODEL = "model"  # what errors call the text of the page
 
 
@@ -63,11 +63,14 @@ class Session:
         wanted = request.get("data")
         if not isinstance(wanted, Mapping):
             raise InputError("no record: drop a CSV file, or simulate one")
-        simulated = wanted.get("kind") != "file"
-        # A simulated record stays that of the text while parameters are changed.
-        base = self.model({"text": request["text"]})
-        key = (str(request["text"]), json.dumps(wanted, sort_keys=True))
-        return _kept(self.records, key, KEPT_RECORDS, lambda: data.given(base if simulated else model, wanted, self.folder))
+        text = request["text"] if wanted.get("kind") == "file" else wanted.get("from") or request["text"]
+        key = (str(text), json.dumps(wanted, sort_keys=True))
+        if wanted.get("kind") == "file":
+            return _kept(self.records, key, KEPT_RECORDS, lambda: data.given(model, wanted, self.folder))
+        # A simulated record stays that of its text while parameters are changed.
+        source = self.model({"text": text})
+        found = _kept(self.records, key, KEPT_RECORDS, lambda: data.given(source, wanted, self.folder))
+        return found if text == request["text"] else data.simulated_by(source, found, model)
 
     def held(self, request: Mapping[str, Any], key: str = "name") -> Held:
         """Return the result that a request names."""

@@ -1,6 +1,6 @@
 // The state of the page in its address: after #, deflated and in base64url. It holds the model, which record, and the method.
 
-const KEPT = ["text", "data", "method", "options", "coordinate", "tab"];
+const KEPT = ["text", "data", "method", "options", "coordinate", "tab", "until"];
 
 export async function encoded(state) {
   const kept = Object.fromEntries(KEPT.map((key) => [key, state[key]]));

@@ -26,10 +26,10 @@ export class Algebra {
       const found = await studio.ask("algebra", { text }, { quiet: true });
       if (!found) { this.seen = null; return; }
       const facts = [["verdict", found.verdict], ["dimension", found.dimension ?? "–"], ["linear rank", found.rank ?? "–"]];
-      this.panel.replaceChildren(h("p", { class: "lead", "data-testid": "verdict" }, SAID[found.verdict] ?? found.verdict),
+      this.panel.replaceChildren(h("p", { class: "lead", "data-testid": "verdict" }, found.verdict === "undecided" && found.note ? `Not decided: ${found.note}.` : SAID[found.verdict] ?? found.verdict),
         h("dl", { class: "facts" }, facts.map(([name, value]) => h("div", {}, h("dt", {}, name), h("dd", {}, String(value))))),
         found.basis.length ? h("p", {}, "Basis: ", h("code", {}, found.basis.join(",  "))) : "",
-        ...(found.certificate ? [h("h3", {}, "Certificate"), h("p", {}, found.certificate)] : []), found.note ? h("p", { class: "small" }, found.note) : "",
+        ...(found.certificate ? [h("h3", {}, "Certificate"), h("p", {}, found.certificate)] : []), found.note && found.verdict !== "undecided" ? h("p", { class: "small" }, found.note) : "",
         found.parameters ? h("p", { class: "small" }, `For ${found.parameters}.`) : "",
         h("details", {}, h("summary", {}, "The whole analysis"), h("pre", {}, found.page)));
     } catch (error) {

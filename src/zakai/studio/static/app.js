@@ -26,7 +26,7 @@ class Studio {
   constructor() {
     this.link = new Link();
     this.works = 0; // computations beside a run that take long
-    this.state = { text: "", data: null, method: "auto", options: {}, coordinate: null, tab: "parameters" };
+    this.state = { text: "", data: null, method: "auto", options: {}, coordinate: null, tab: "parameters", until: null };
     this.model = null; // what the text holds, null while it has an error
     this.summary = null; // of the main result
     this.editor = new Editor(byId("editor"), (text) => this.write(text));
@@ -123,7 +123,7 @@ class Studio {
 
   /** Take another model, with a record that is simulated for it, and filter. */
   async load(text, data) {
-    Object.assign(this.state, { text, data, method: "auto", options: {}, coordinate: null });
+    Object.assign(this.state, { text, data, method: "auto", options: {}, coordinate: null, until: null });
     this.editor.value = text;
     this.data.draw();
     this.method.clear();
@@ -142,6 +142,13 @@ class Studio {
     this.state.text = text;
     this.remember();
     this.read();
+  }
+
+  /** Other values of parameters are to be filtered with the record that is there. */
+  async changeParameters(values) {
+    this.data.keep();
+    const texts = Object.fromEntries(Object.entries(values).map(([name, value]) => [name, String(value)]));
+    if (await this.change({ parameters: texts })) await this.run();
   }
 
   /** Keys of the model were changed by a form or a slider. */
@@ -191,6 +198,7 @@ class Studio {
   async run() {
     if (this.running) { this._next(); return; }
     if (!this.model) return;
+    if (this.works && !this.tabs.get("compare").kept.length) this.link.drop(); // a run does not wait for what it makes outdated
     if (!this.model.prior) { this.say("The model has no prior: add a table [prior] to filter; it can be analysed without.", true); return; }
     this.busy(true, "Filtering …");
     this.begun = { at: performance.now(), asked: JSON.stringify(this.request) };

@@ -3,7 +3,7 @@
 import { DensityView } from "./density.js";
 import { h, number, table } from "./dom.js";
 
-const MOST = 4;
+const NAMES = ["kept1", "kept2", "kept3", "kept4"], MOST = NAMES.length;
 
 export class Compare {
   constructor(studio) {
@@ -27,13 +27,13 @@ export class Compare {
   async keep() {
     const { studio } = this;
     if (!studio.summary) { studio.say("Run a filter first.", true); return; }
-    const name = `kept${++this.number}`, label = this._unused(this.label.value.trim() || `result ${this.number}`);
-    studio.busy(true, "Filtering …");
-    const found = await studio.ask("run", { ...studio.request, name }, { channel: "keep", progress: (done, total) => studio.progressed(done, total) });
-    studio.busy(false);
+    const kept = this.kept.slice(1 - MOST), name = NAMES.find((one) => !kept.some((other) => other.name === one));
+    const label = this._unused(this.label.value.trim() || `result ${++this.number}`);
+    const found = await studio.ask("keep", { of: "main", name });
     if (!found) return;
+    studio.data.keep(); // only results for one record can be compared
     studio.say(`Kept as “${label}”.`);
-    this.kept = [...this.kept, { name, label, summary: found, request: studio.request }].slice(-MOST);
+    this.kept = [...kept, { name, label, summary: found }];
     await this.draw();
   }
 

@@ -58,7 +58,29 @@ export class Data {
       this.studio.state.data = { ...this.studio.state.data, inputs: { ...data.inputs, [name]: Number(target.value) } };
       this.changed();
     } })));
-    return h("div", { class: "fields" }, box("until", "Until"), box("step", "Step"), box("seed", "Seed"), inputs);
+    this.source = h("p", { class: "small", "data-testid": "record-source" });
+    this._source();
+    return h("div", {}, h("div", { class: "fields" }, box("until", "Until"), box("step", "Step"), box("seed", "Seed"), inputs), this.source);
+  }
+
+  /** The record stays that of the model as it is now, whatever becomes of the model. */
+  keep() {
+    const { state } = this.studio;
+    if (state.data.kind === "file" || state.data.from) return;
+    state.data = { ...state.data, from: state.text };
+    this._source();
+  }
+
+  /** Say which model simulates the record, and offer the other way. */
+  _source() {
+    const { studio } = this, kept = Boolean(studio.state.data.from);
+    const change = () => {
+      if (kept) studio.state.data = { ...studio.state.data, from: undefined }; else this.keep();
+      this._source();
+      if (kept) this.changed(); else studio.remember();
+    };
+    this.source?.replaceChildren(kept ? "The record is kept while the model changes, to compare. " : "Another model draws another record. ",
+      h("button", { type: "button", class: "place", "data-testid": "keep-record", onclick: change }, kept ? "Simulate again" : "Keep this record"));
   }
 
   _upload(data) {

@@ -47,7 +47,7 @@ export class Link {
   }
 
   /** Ask for an answer; a promise, which an error of the studio or a newer request of the channel rejects. */
-  ask(what, request = {}, { channel = what, progress } = {}) {
+  ask(what, request = {}, { channel = what, progress, work } = {}) {
     const id = ++this.number;
     const before = this.waiting.get(this.latest.get(channel));
     if (before) {
@@ -57,9 +57,19 @@ export class Link {
     this.latest.set(channel, id);
     return new Promise((resolve, reject) => {
       if (this.socket?.readyState !== WebSocket.OPEN) { reject(new Error("the studio does not answer; start it again")); return; }
-      this.waiting.set(id, { channel, resolve, reject, progress });
+      this.waiting.set(id, { channel, resolve, reject, progress, work });
       this.socket.send(JSON.stringify({ ...request, do: what, id, channel }));
     });
+  }
+
+  /** End the requests that may take long; nobody waits for their answers any more. */
+  drop() {
+    for (const [id, one] of this.waiting) {
+      if (!one.work) continue;
+      this.waiting.delete(id);
+      one.reject(new Superseded("a run has made it outdated"));
+    }
+    this.tell("cancel");
   }
 
   /** Tell the studio something that has no answer. */

@@ -106,8 +106,7 @@ export class Parameters {
     this.dragged = false;
     this.next = null;
     if (Object.keys(values).every((name) => values[name] === parameters[name])) return;
-    const texts = Object.fromEntries(Object.entries(values).map(([name, value]) => [name, String(value)]));
-    if (await this.studio.change({ parameters: texts })) await this.studio.run();
+    await this.studio.changeParameters(values);
   }
 
   async fit() {
@@ -122,12 +121,7 @@ export class Parameters {
     this.fitted.replaceChildren(h("h3", {}, "Maximum likelihood"), table(["parameter", "estimate", "standard error", "95% interval"], rows, "numbers"),
       h("p", { class: "small" }, `Log-likelihood ${number(found.log_likelihood, 7)} by ${found.method}; ${found.message}.`),
       found.warnings.length ? h("ul", { class: "notes" }, found.warnings.map((one) => h("li", {}, one))) : "",
-      h("button", { type: "button", "data-testid": "take-fit", onclick: () => this._take(found.estimates) }, "Take these values"));
-  }
-
-  async _take(estimates) {
-    const texts = Object.fromEntries(Object.entries({ ...this.studio.model.parameters, ...estimates }).map(([name, value]) => [name, String(value)]));
-    if (await this.studio.change({ parameters: texts })) await this.studio.run();
+      h("button", { type: "button", "data-testid": "take-fit", onclick: () => studio.changeParameters({ ...studio.model.parameters, ...found.estimates }) }, "Take these values"));
   }
 
   async profile() {

@@ -16,6 +16,14 @@ export class Result {
       studio.remember();
       this.picture();
     });
+    byId("ahead").addEventListener("submit", (event) => {
+      event.preventDefault();
+      studio.state.until = byId("until").valueAsNumber;
+      const { last } = this.available.get("main");
+      if (!(studio.state.until > last)) { studio.say(`Forecast: take a time after the end of the record, ${number(last)}.`, true); return; }
+      studio.remember();
+      this._forecast();
+    });
   }
 
   get states() { return this.available.get(this.name)?.states ?? []; }
@@ -43,6 +51,8 @@ export class Result {
     select.replaceChildren(...found.states.map((state) => h("option", { value: state, selected: state === this.coordinate }, state)));
     byId("coordinate-label").hidden = found.states.length < 2;
     this._buttons();
+    byId("ahead").hidden = name !== "forecast";
+    if (name === "forecast") byId("until").value = String(Number(found.last.toPrecision(12)));
     this.words(found);
     await this.picture();
   }
@@ -64,13 +74,17 @@ export class Result {
       if (!found) return;
       studio.say("Smoothed: each density is given all observations, earlier and later.");
       await this.show(name, found);
-    } else {
-      const main = this.available.get("main"), length = (main.last - main.first) / 5;
-      const found = await studio.ask("forecast", { of: "main", until: main.last + length, step: length / 100, name }, { work: true });
-      if (!found) return;
-      studio.say(`Forecast: ${number(length)} beyond the end of the record, without observations.`);
-      await this.show(name, found);
-    }
+    } else await this._forecast();
+  }
+
+  /** Forecast to the time that the reader chooses; at first a fifth of the record beyond its end. */
+  async _forecast() {
+    const { studio } = this, { first, last } = this.available.get("main"), { until } = studio.state;
+    const end = Number.isFinite(until) && until > last ? until : last + (last - first) / 5;
+    const found = await studio.ask("forecast", { of: "main", until: end, step: (end - last) / 100, name: "forecast" }, { work: true });
+    if (!found) return;
+    studio.say(`Forecast: ${number(end - last)} beyond the end of the record, without observations.`);
+    await this.show("forecast", found);
   }
 
   /** Ask for what can be seen. */

@@ -27,7 +27,7 @@ export class Takeaway {
   async take(what, type) {
     const { studio } = this;
     studio.say(`Writing ${what} …`);
-    const found = await studio.ask("export", { ...studio.request, what, name: "main" });
+    const found = await studio.ask("export", { ...studio.request, what, name: "main" }, { work: true });
     if (!found) return;
     save(what, found.arrays.bytes, type);
     studio.say(`${what} is in your downloads.`);
