@@ -31,9 +31,8 @@ def _state(model: Any) -> list[str]:
     for i, symbol in enumerate(model.x):
         terms = [(model.drift[i, 0], [_differential(model.t)])]
         letter = _letter(model, "v")
-        terms += [
-            (entry, [_differential(_indexed(letter, j, noises))]) for (_, j), entry in sorted(model.diffusion.row(i).todok().items())
-        ]
+        entries = sorted(model.diffusion.row(i).todok().items())
+        terms += [(entry, [_differential(_indexed(letter, j, noises))]) for (_, j), entry in entries]
         rows.append(_row(_differential(symbol), _operator("="), *_sum(terms)))
     said = "State" + (
         f": {_names(model.periodic)} {'is an angle' if len(model.periodic) == 1 else 'are angles'}, on the circle"

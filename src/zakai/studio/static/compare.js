@@ -20,7 +20,7 @@ export class Compare {
   }
 
   filtered(found) {
-    const values = Object.entries(this.studio.model.parameters).slice(0, 3).map(([name, value]) => `${name} = ${number(value, 3)}`).join(", ");
+    const values = Object.entries(this.studio.model.parameters).slice(0, 6).map(([name, value]) => `${name} = ${number(value, 3)}`).join(", ");
     this.label.value = [found.method, values].filter(Boolean).join(", ");
   }
 
