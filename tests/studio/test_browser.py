@@ -208,3 +208,82 @@ def test_nothing_is_wider_than_a_phone(browser: Browser, address: str):
         assert page.evaluate("document.documentElement.scrollWidth") <= 360
         for testid in ("model-text", "run", "method", "slider-a", "density"):
             expect(page.get_by_test_id(testid)).to_be_visible()
+
+
+def open_part(page: Page, part: str) -> None:
+    page.get_by_test_id(f"tab-{part}").click()
+
+
+def test_a_slider_keeps_the_record_so_that_two_values_are_compared(page: Page):
+    open_part(page, "compare")
+    page.get_by_test_id("keep").click()
+    expect_status(page, "Kept as")
+    before, seen = likelihood(page), page.get_by_role("img", name="The record").screenshot()
+    open_part(page, "parameters")
+    page.get_by_test_id("value-r").fill("0.9")
+    page.get_by_test_id("value-r").press("Enter")
+    expect(page.get_by_test_id("fact-log-likelihood")).not_to_have_text(before)
+    expect_status(page, "Filtered 600")
+    assert page.get_by_role("img", name="The record").screenshot() == seen
+    open_part(page, "compare")
+    page.get_by_test_id("keep").click()
+    rows = page.get_by_test_id("compare-table").locator("tbody tr")
+    expect(rows).to_have_count(2)
+    figures = [float(cell.replace("−", "-")) for cell in rows.locator("td:nth-child(3)").all_inner_texts()]
+    shown = [float(value.replace("−", "-")) for value in (before, likelihood(page))]
+    assert figures == pytest.approx(shown, abs=1e-3) and figures[0] > figures[1]
+    page.get_by_test_id("keep-record").click()  # simulate again, with the new value
+    expect(page.get_by_test_id("fact-log-likelihood")).not_to_have_text(re.compile(re.escape(f"{shown[1]}".replace("-", "−"))))
+
+
+def test_the_reader_chooses_the_end_of_the_forecast(page: Page):
+    page.get_by_test_id("show-forecast").click()
+    expect(page.get_by_test_id("forecast-until")).to_have_value("72")
+    page.get_by_test_id("forecast-until").fill("200")
+    page.get_by_test_id("forecast-until").press("Enter")
+    expect_status(page, "Forecast: 140 beyond")
+    expect(page.locator("#verdict")).to_contain_text("t = 200")
+    page.get_by_test_id("forecast-until").fill("9")
+    page.get_by_test_id("forecast-until").press("Enter")
+    expect_status(page, "after the end of the record, 60")
+
+
+def test_the_observations_of_a_slow_method_show_their_progress_and_end_for_a_run(page: Page):
+    page.get_by_test_id("option-tolerance").fill("1e-9")
+    page.get_by_test_id("option-tolerance").press("Enter")
+    page.get_by_test_id("simulate-until").fill("600")
+    page.get_by_test_id("simulate-until").press("Enter")
+    expect_status(page, "Filtered 6,000")
+    open_part(page, "residuals")
+    expect(page.get_by_test_id("progress")).to_have_attribute("aria-valuenow", re.compile(r"\d"))
+    page.get_by_test_id("simulate-until").fill("10")
+    page.get_by_test_id("simulate-until").press("Enter")
+    expect_status(page, "Filtered 100")
+    expect(page.locator("canvas[data-testid=pit-y1]")).to_be_visible(timeout=PATIENCE)
+
+
+def test_a_profile_shows_the_values_around_the_maximum(page: Page):
+    page.get_by_test_id("profile-of").select_option("r")
+    page.get_by_test_id("profile").click()
+    expect_status(page, "The log-likelihood for values of r")
+    heights = page.evaluate("[...window.studio.tabs.get('parameters').profiled.series[0].y]")
+    finite = [height for height in heights if height == height]
+    assert len(heights) == 15 and sum(height > max(finite) - 6 for height in finite) >= 7
+
+
+def test_a_record_with_other_names_of_its_columns_is_mapped(page: Page, tmp_path: Path):
+    rows = "".join(f"{0.3 * k:g};{k};2024-01-01 00:{k:02}:00\n" for k in range(1, 31))
+    (tmp_path / "mine.csv").write_text("level;number;Timestamp\n" + rows)
+    page.get_by_test_id("data-file").click()
+    page.get_by_test_id("record-file").set_input_files(tmp_path / "mine.csv")
+    expect(page.get_by_test_id("column-time")).to_have_value("Timestamp")
+    expect(page.get_by_test_id("data-error")).to_contain_text("Choose the column of y1")
+    page.get_by_test_id("column-y1").select_option("level")
+    expect(page.get_by_test_id("fact-observations")).to_have_text("30")
+    expect(page.get_by_test_id("data-facts")).to_contain_text("t = 0 at 2024-01-01 00:01:00")
+    page.get_by_test_id("record-origin").fill("2024-01-01")
+    page.get_by_test_id("record-origin").press("Tab")
+    expect(page.get_by_test_id("data-facts")).to_contain_text("t = 0 at 2024-01-01 00:00:00")
+    page.get_by_test_id("column-time").select_option("number")
+    page.get_by_test_id("column-y1").select_option("level")
+    expect(page.get_by_test_id("data-facts")).to_contain_text("times 1 to 30")

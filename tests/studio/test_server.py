@@ -314,3 +314,68 @@ def test_an_address_that_holds_something_else_is_refused(key: str, value):
     given = {"text": SPIRAL, "data": SIMULATED, "do": "run", "id": 1, key: value}
     header = unpacked(computed(Session(Path()), given, 4.0, None))
     assert "error" in header and "fault of zakai" not in header["error"]
+
+
+def test_the_script_of_a_record_with_dates_and_another_time_column_computes_the_same(page: Page, tmp_path):
+    text = zakai.gallery.text("kalman-bucy-1d")
+    rows = "level,stamp\n# a remark\n0.1,2024-01-01 00:30\n,2024-01-01 01:15\n-0.3,2024-01-01 02:00\n"
+    number = page.upload(rows.encode()).json()["file"]
+    dates = {"time": "stamp", "unit": "h", "origin": "2024-01-01"}
+    data = {"kind": "file", "file": number, "name": "mine.csv", "columns": ["level"], **dates}
+    assert page.ask("columns", **{**data, "time": None})["every"] == ["level", "stamp"]
+    answer = page.ask("run", text=text, data=data, name="main")
+    (tmp_path / "filter.py").write_bytes(page.ask("export", what="filter.py", text=text, data=data)["bytes"].tobytes())
+    done = subprocess.run([sys.executable, "filter.py"], cwd=tmp_path, capture_output=True, text=True, check=True)
+    assert f"log-likelihood {answer['log_likelihood']!r}" in done.stdout
+    assert "no column 'clock'" in page.ask("describe", text=text, data={**data, "time": "clock"})["error"]
+    bad = page.upload(b"level,stamp\n0.1,1\n0.2,2\nmuch,3\n").json()["file"]
+    wrong = {**data, "file": bad, "unit": None, "origin": None}
+    assert page.ask("describe", text=text, data=wrong)["error"].startswith("mine.csv: row 4: 'much'")
+
+
+TABLED = """state = ["x"]  # of my own
+drift = ["-x"]
+observation = ["gain(x)"]
+observation_kind = "samples"
+[tables]
+gain = { file = "gain.csv", kind = "linear" }
+[prior]
+kind = "gaussian"
+mean = [0.0]
+cov = [[0.5]]
+"""
+
+
+def test_the_script_of_a_model_with_a_table_in_a_file_holds_the_table(tmp_path):
+    (tmp_path / "gain.csv").write_text("x,gain\n-3,-3\n0,1\n3,2\n")
+    (tmp_path / "fresh").mkdir()
+    client, token = studio(tables=tmp_path)
+    given = {"data": {"kind": "simulate", "until": 1.0, "step": 0.1, "seed": 0}}
+    with client, client.websocket_connect(f"/{token}/socket", headers={"host": HOST, "origin": ORIGIN}) as socket:
+        page = Page(client, token, socket)
+        answer = page.ask("run", text=TABLED, name="main", **given)
+        script = page.ask("export", what="filter.py", text=TABLED, **given)["bytes"].tobytes()
+        plain = TABLED.replace('file = "gain.csv", kind = "linear"', 'kind = "linear", x = [-3, 3], values = [-3, 2]')
+        assert page.ask("export", what="model.toml", text=plain)["bytes"].tobytes().decode() == plain
+    (tmp_path / "fresh" / "filter.py").write_bytes(script)
+    done = subprocess.run([sys.executable, "filter.py"], cwd=tmp_path / "fresh", capture_output=True, text=True, check=True)
+    assert f"log-likelihood {answer['log_likelihood']!r}" in done.stdout
+
+
+def test_a_record_is_kept_while_the_model_changes(page: Page, tmp_path):
+    data = {**SIMULATED, "from": SPIRAL}
+    other = SPIRAL.replace("[[3.0]]", "[[1.0]]")
+    assert other != SPIRAL
+    answer = page.ask("run", text=other, data=data, name="main")
+    drawn = page.ask("export", what="record.csv", text=SPIRAL, data=SIMULATED)["bytes"].tobytes()
+    assert page.ask("export", what="record.csv", text=other, data=data)["bytes"].tobytes() == drawn
+    (tmp_path / "filter.py").write_bytes(page.ask("export", what="filter.py", text=other, data=data)["bytes"].tobytes())
+    done = subprocess.run([sys.executable, "filter.py"], cwd=tmp_path, capture_output=True, text=True, check=True)
+    assert f"log-likelihood {answer['log_likelihood']!r}" in done.stdout
+    (tmp_path / "record.csv").write_bytes(drawn)
+    (tmp_path / "model.toml").write_text(other)
+    lines = page.ask("shell", text=other, data=data)["text"]
+    subprocess.run(lines, cwd=tmp_path, shell=True, capture_output=True, check=True, env=shell_environment())
+    assert zakai.load_result(tmp_path / "result.nc").log_likelihood == answer["log_likelihood"]
+    said = page.ask("run", text=zakai.gallery.text("kalman-bucy-1d"), data=data)["error"]
+    assert "press Simulate again" in said

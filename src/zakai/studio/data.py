@@ -18,7 +18,9 @@ from zakai.records.csv import Dates, clock_of, read_table
 from zakai.records.dates import date_of
 from zakai.records.dialect import dialect_of
 from zakai.records.header import cells_of, header_of
+from zakai.records.numbers import NUMBER
 from zakai.simulation.simulate import simulate
+from zakai.studio.time_column import with_time
 
 MOST_ROWS, MOST_COLUMNS = 1_000_000, 200
 MOST_SIMULATED = 200_000  # observations that are drawn on demand
@@ -41,7 +43,7 @@ def given(model: Model, request: Mapping[str, Any], folder: Path) -> Given:
         model: the system.
         request: `{"kind": "simulate", "until", "step", "seed", "inputs", "from"}`, the last the text of another model that
             simulates the record, or
-            `{"kind": "file", "file", "columns", "inputs", "unit", "origin", "truth": {"file", "name"}}`.
+            `{"kind": "file", "file", "columns", "inputs", "unit", "origin", "time", "truth": {"file", "name"}}`.
         folder: where the files are that were given to the studio.
 
     Raises:
@@ -120,7 +122,8 @@ def file_of(request: Mapping[str, Any], folder: Path) -> Path:
     number = request.get("file")
     if not isinstance(number, str) or not _IDENTIFIER.fullmatch(number) or not (folder / f"{number}.csv").is_file():
         raise InputError("the file is no longer here; drop it again")
-    return folder / f"{number}.csv"
+    path, column = folder / f"{number}.csv", request.get("time")
+    return with_time(path, str(column), str(request.get("name") or "the record")[:80]) if column else path
 
 
 def _matched(model: Model, names: list[str]) -> list[str]:
@@ -153,10 +156,11 @@ def columns_of(request: Mapping[str, Any], folder: Path) -> dict[str, Any]:
     if dialect is not None:
         after = dialect.translated(lines[dialect.line :])
         rows = [[cell.strip()[:24] for cell in cells_of(line)] for line in after if line.strip()][:PREVIEWED]
-    if names[0] != "time":
-        raise InputError(f"{name}: the first column is {names[0][:40]!r}; the header must begin with time")
+    if all(NUMBER.fullmatch(one) for one in names):
+        raise InputError(f"{name}: has no header; its first line must be names, one of them the time's")
     dated = bool(rows) and date_of(rows[0][0].strip('"')) is not None
-    return {"columns": names, "rows": rows, "dated": dated}
+    every = header_of(file_of({**request, "time": None}, folder))
+    return {"columns": names, "every": every, "rows": rows, "dated": dated, "timed": names[0] == "time"}
 
 
 def described(model: Model, found: Given) -> tuple[dict[str, Any], dict[str, np.ndarray]]:

@@ -90,12 +90,10 @@ def script(session: Session, request: Mapping[str, Any]) -> str:
     ]
     if _is_simulated(request):
         lines += _simulated(model, wanted, record)
-    elif record.values.size + record.times.size <= EMBEDDED and record.clock is None:
+    elif record.values.size + record.times.size <= EMBEDDED:
         lines += _embedded(model, record)
-    elif wanted.get("kind") != "file":
-        lines.append('record = zakai.read_record("record.csv", model)  # the record among the exports')
     else:
-        lines += _from_file(wanted, found.name)
+        lines.append(_from_file(wanted, found.name))
     arguments = "".join(f", {key}={value!r}" for key, value in options.items())
     lines += [
         f'result = zakai.filter(model, record, method="{method}"{arguments})',
@@ -145,13 +143,17 @@ def _embedded(model: Any, record: Any) -> list[str]:
         times, values = (f"np.array({part.tolist()!r})" for part in (record.inputs.times, record.inputs.values))
         lines.append(f"inputs = zakai.Inputs.of_rows({times}, {values})")
         inputs = ", inputs=inputs"
-    return [*lines, f'record = zakai.Record(rows[:, 0], rows[:, 1:], "{record.kind}"{inputs})']
+    clock = {} if record.clock is None else record.clock._asdict()
+    dates = "".join(f", {key}={str(value)!r}" for key, value in clock.items())
+    return [*lines, f'record = zakai.Record(rows[:, 0], rows[:, 1:], "{record.kind}"{inputs}{dates})']
 
 
-def _from_file(wanted: Mapping[str, Any], name: str) -> list[str]:
+def _from_file(wanted: Mapping[str, Any], name: str) -> str:
     more = "".join(f", {key}={wanted[key]!r}" for key in ("unit", "origin") if wanted.get(key))
+    if wanted.get("kind") != "file" or wanted.get("time"):
+        return f'record = zakai.read_record("record.csv", model{more})  # the record among the exports'
     columns = f", columns={list(wanted['columns'])!r}" if wanted.get("columns") else ""
-    return [f"record = zakai.read_record({name!r}, model{more}{columns})  # the file that was given to the studio"]
+    return f"record = zakai.read_record({name!r}, model{more}{columns})  # the file that was given to the studio"
 
 
 def _literal(text: str) -> str:
@@ -174,7 +176,7 @@ def shell(session: Session, request: Mapping[str, Any], report: Report) -> Answe
     extra += "".join(f" --option {key}={value}" for key, value in options.items())
     lines = []
     if not _is_simulated(request):
-        extra += f" --unit {wanted['unit']}" if wanted.get("unit") else ""
+        extra += "".join(f" --{key} '{_one_line(str(wanted[key]))}'" for key in ("unit", "origin") if wanted.get(key))
     else:
         until, step, seed = wanted.get("until"), wanted.get("step"), wanted.get("seed", 0)
         known = ""

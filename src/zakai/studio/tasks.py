@@ -33,7 +33,7 @@ def carried_out(session: Session, request: Mapping[str, Any], report: Report) ->
     wanted = request.get("data")
     inside = dict(wanted) if isinstance(wanted, Mapping) else {}
     simulated = inside.get("kind") != "file"
-    inside_shapes = {"columns": list, "from": str, "inputs": Mapping if simulated else list}
+    inside_shapes = {"columns": list, "from": str, "time": str, "inputs": Mapping if simulated else list}
     for given, shapes in ((request, SHAPES), (inside, inside_shapes)):
         for key, shape in shapes.items():
             if given.get(key) is not None and not isinstance(given[key], shape):

@@ -5,6 +5,7 @@ import { upload } from "./link.js";
 import { LinePanel } from "./panels.js";
 
 const LARGEST = 64 << 20;
+const LIKELY = /time|date|stamp|^t$/i; // names of a column of times
 const UNITS = ["", "ns", "us", "ms", "s", "min", "h", "d"];
 
 export class Data {
@@ -86,7 +87,7 @@ export class Data {
   _upload(data) {
     const input = h("input", { type: "file", accept: ".csv,.txt,.tsv,text/csv", "data-testid": "record-file", id: "record-file", class: "file", onchange: ({ target }) => target.files[0] && this.take(target.files[0]) });
     return h("div", {}, h("label", { class: "drop", for: "record-file" }, data.name ? h("strong", {}, data.name) : "Drop a CSV file here, or choose one",
-      h("small", {}, "first column time, then what was observed; at most 64 MiB and a million rows")), input, this.columns);
+      h("small", {}, "a column with the time, others with what was observed; at most 64 MiB and a million rows")), input, this.columns);
   }
 
   async take(file) {
@@ -129,14 +130,36 @@ export class Data {
     } catch (error) { this.wrong(error.message); return; }
     if (!found) return;
     this.found = found;
+    if (!found.timed) {
+      const likely = found.every.find((name) => LIKELY.test(name));
+      if (likely) { await this._timed(likely, fresh); return; }
+      this.columns.replaceChildren(h("div", { class: "fields" }, this._time()));
+      this.wrong("Choose the column of the time.", "columns to choose");
+      return;
+    }
     if (found.dated && !data.unit) this.studio.state.data = { ...data, unit: "h" };
     this._mapping();
     this.changed(fresh);
   }
 
+  /** Take another column as the time. */
+  async _timed(time, fresh = true) {
+    this.studio.state.data = { ...this.studio.state.data, time, columns: undefined, inputs: undefined, unit: undefined, origin: undefined };
+    const chosen = document.activeElement?.dataset.testid === "column-time";
+    this.columns.replaceChildren(h("div", { class: "fields" }, this._time())); // the other columns are to be matched again
+    await this._columns(fresh);
+    if (chosen) this.columns.querySelector("[data-testid=column-time]")?.focus();
+  }
+
+  _time() {
+    const { time } = this.studio.state.data;
+    return field("time", h("select", { "data-testid": "column-time", onchange: ({ target }) => this._timed(target.value) },
+      time ? null : h("option", { value: "", selected: true }, "choose …"), this.found.every.map((name) => h("option", { value: name, selected: name === time }, name))));
+  }
+
   _mapping() {
     const { found } = this, { model, state: { data } } = this.studio;
-    if (!found || !model || data.kind !== "file") return;
+    if (!found?.timed || !model || data.kind !== "file") return;
     const names = found.columns.slice(1), [columns, inputs] = matched(names, data, model);
     this.studio.state.data = { ...data, columns, inputs };
     const choose = (what, chosen, key, j) => field(what, h("select", { "data-testid": `column-${what.split(" ").pop()}`, onchange: ({ target }) => {
@@ -149,9 +172,13 @@ export class Data {
       h("input", { type: "file", accept: ".csv,.txt,.tsv,text/csv", class: "file", id: "truth-file", "data-testid": "truth-file", onchange: ({ target }) => target.files[0] && this._truth(target.files[0]) })];
     const unit = field("Unit of time", h("select", { onchange: ({ target }) => { this.studio.state.data = { ...this.studio.state.data, unit: target.value || undefined }; this.changed(); } },
       UNITS.map((name) => h("option", { value: name, selected: name === (data.unit ?? this.studio.state.data.unit ?? "") }, name || "numbers"))), found.dated ? "of the model; the file has dates" : "");
-    this.columns.replaceChildren(h("div", { class: "fields" },
+    const origin = found.dated ? field("t = 0 at", h("input", { type: "text", "data-testid": "record-origin", value: data.origin ?? "", placeholder: "the first date", onchange: ({ target }) => {
+      this.studio.state.data = { ...this.studio.state.data, origin: target.value.trim() || undefined };
+      this.changed();
+    } }), "a date such as 2024-01-31T12:00") : null;
+    this.columns.replaceChildren(h("div", { class: "fields" }, data.time ? this._time() : null,
       columns.map((name, j) => choose(`observation ${model.observations[j]}`, name, "columns", j)),
-      inputs.map((name, j) => choose(`input ${model.inputs[j]}`, name, "inputs", j)), unit), ...truth,
+      inputs.map((name, j) => choose(`input ${model.inputs[j]}`, name, "inputs", j)), unit, origin), ...truth,
       h("div", { class: "scroll" }, h("table", { class: "preview" }, h("thead", {}, h("tr", {}, found.columns.map((name) => h("th", {}, name)))),
         h("tbody", {}, found.rows.slice(0, 3).map((row) => h("tr", {}, row.map((cell) => h("td", {}, cell || "–"))))))));
   }

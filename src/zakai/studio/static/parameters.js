@@ -135,7 +135,8 @@ export class Parameters {
     const place = h("div", {});
     this.drawn.replaceChildren(h("h3", {}, `Log-likelihood along ${parameter}`), place, h("p", { class: "small" }, "The dashed line is 1.92 below the highest value: what is above it is the 95% interval where the other parameters are known."));
     const shown = heights.map((value) => (value < best - 20 ? NaN : value));
-    new LinePanel(place, { label: `Log-likelihood along ${parameter}`, height: 260 }).show({ x: { title: parameter }, y: { title: "log-likelihood" },
+    this.profiled = new LinePanel(place, { label: `Log-likelihood along ${parameter}`, height: 260 });
+    this.profiled.show({ x: { title: parameter }, y: { title: "log-likelihood" },
       series: [{ role: "l", text: "log-likelihood", x: values, y: shown }, { role: "d", text: "", x: values, y: shown, dots: true }], marks: [{ y: best - 1.92 }, { x: one.now, dash: [2, 2] }] });
   }
 }
