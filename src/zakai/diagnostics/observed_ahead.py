@@ -32,7 +32,7 @@ DRAWS = 20_000  # of a density that is no mixture
 SMALL = 1e-10  # weight of a point, relative to the largest, that is left out
 HALVINGS = 60  # of the bracket of a quantile
 EXTENT = 39.0  # standard deviations beyond which a Gaussian has no probability in double precision
-ROUNDING = 1e-13  # last step of a quantile, in standard deviations of the law
+ROUNDING = 1e-13  # last step of a quantile, relative to the law
 
 
 class Law(NamedTuple):
@@ -94,6 +94,7 @@ class Law(NamedTuple):
         mean = self.weights @ self.means
         scale = np.sqrt(self.weights @ ((self.means - mean) ** 2 + deviations**2))
         z, step = np.clip(mean + ndtri(probability) * scale, low, high), high - low
+        found = np.zeros(len(z), bool)
         for _ in range(2 * HALVINGS):
             scores = (z - self.means) / deviations
             excess = self.weights @ ndtr(scores) - probability
@@ -103,8 +104,10 @@ class Law(NamedTuple):
                 proposed = z - excess / slope
             converges = (low < proposed) & (proposed < high) & (np.abs(proposed - z) < 0.5 * np.abs(step))
             proposed = np.where(converges, proposed, 0.5 * (low + high))
-            step, z = proposed - z, proposed
-            if (np.abs(step) <= ROUNDING * scale).all():
+            step = np.where(found, 0.0, proposed - z)
+            z = z + step
+            found |= np.abs(step) <= ROUNDING * (scale + np.abs(z))
+            if found.all():
                 break
         return np.asarray(self.shift + self.scale * z)
 

@@ -229,7 +229,12 @@ class Studio {
     if (on) this.say(said);
     if (!on && this.again) { this.again = false; setTimeout(() => this.run()); } // what was wanted meanwhile
     clearTimeout(this.patience);
-    if (on) this.patience = setTimeout(() => this.running && !this.reported && this.say(`${said} The first run on a machine compiles kernels, which takes up to a minute.`), 6000);
+    this.compiling = "";
+    if (on) this.patience = setTimeout(() => {
+      if (!this.running || this.reported) return;
+      this.compiling = said;
+      this.say(`${said} The first run on a machine compiles kernels, which takes up to a minute.`);
+    }, 6000);
   }
 
   progressed(done, total) {
@@ -241,7 +246,8 @@ class Studio {
       bar.setAttribute("aria-valuenow", share);
       bar.firstElementChild.style.width = `${share}%`;
       bar.title = `${done.toLocaleString("en")} of ${total.toLocaleString("en")}`;
-    } else bar.removeAttribute("aria-valuenow");
+      if (this.compiling) { this.say(this.compiling); this.compiling = ""; }
+    } else { bar.removeAttribute("aria-valuenow"); bar.title = ""; }
   }
 
   async _remember() {

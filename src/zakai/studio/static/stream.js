@@ -1,6 +1,6 @@
 // A stream: a file that grows, or standard input; filtered as it arrives.
 
-import { h, number } from "./dom.js";
+import { counted, h, number } from "./dom.js";
 
 export class Stream {
   constructor(studio) {
@@ -43,6 +43,7 @@ export class Stream {
     this.faults.replaceChildren(...header.faults.map((one) => h("li", {}, one)));
     if (header.time === null) return;
     this.said.textContent = `t = ${number(header.time, 8)}`;
+    if (this.on) studio.say(`Following: ${counted(header.count, "observation")} filtered.`);
     this.estimate.replaceChildren(...header.states.map((name, i) => h("div", {}, h("dt", {}, name), h("dd", {}, `${number(header.mean[i], 4)}`, h("small", {}, ` ${header.interval[i].map((end) => number(end, 3)).join(" to ")}`)))),
       h("div", {}, h("dt", {}, "log-likelihood"), h("dd", {}, number(header.log_likelihood, 6))));
     const now = performance.now();
