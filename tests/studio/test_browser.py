@@ -279,7 +279,7 @@ def test_a_record_with_other_names_of_its_columns_is_mapped(page: Page, tmp_path
     expect(page.get_by_test_id("column-time")).to_have_value("Timestamp")
     expect(page.get_by_test_id("data-error")).to_contain_text("Choose the column of y1")
     page.get_by_test_id("column-y1").select_option("level")
-    expect(page.get_by_test_id("fact-observations")).to_have_text("30")
+    expect(page.get_by_test_id("fact-observations")).to_have_text("30", timeout=PATIENCE)
     expect(page.get_by_test_id("data-facts")).to_contain_text("t = 0 at 2024-01-01 00:01:00")
     page.get_by_test_id("record-origin").fill("2024-01-01")
     page.get_by_test_id("record-origin").press("Tab")

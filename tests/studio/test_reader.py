@@ -9,7 +9,7 @@ import pytest
 from playwright.sync_api import Page, expect
 
 import zakai
-from studio.test_browser import address, expect_status, likelihood, page, replace  # noqa: F401
+from studio.test_browser import PATIENCE, address, expect_status, likelihood, page, replace  # noqa: F401
 
 INPUT = ('observation = ["x**2 + c*x"]', 'observation = ["x**2 + c*x"]\ninputs = ["u"]')
 LONG = 'text => { studio.load(text, { kind: "simulate", until: 200, step: 0.01, seed: 0 }); }'
@@ -37,7 +37,7 @@ def test_columns_are_chosen_where_no_name_says_which_they_are(page: Page, tmp_pa
     expect(page.get_by_test_id("data-error")).to_have_text("Choose the column of u.")
     page.get_by_test_id("column-u").select_option("Strom")
     expect(page.get_by_test_id("data-error")).to_be_hidden()
-    expect(page.get_by_test_id("fact-observations")).to_have_text("30")
+    expect(page.get_by_test_id("fact-observations")).to_have_text("30", timeout=PATIENCE)
     (tmp_path / "model.toml").write_text(page.get_by_test_id("model-text").input_value())
     model, table = zakai.load_model(tmp_path / "model.toml"), np.round(np.array(rows), 4)
     inputs = zakai.Inputs.of_rows(table[:, 0], table[:, 2:3])

@@ -152,10 +152,11 @@ def test_text_that_takes_long_does_not_keep_the_next_one_waiting(page: Page):
     assert page.ask("check", text=SPIRAL)["model"]["state"] == ["x"]
 
 
-def test_the_lines_for_a_shell_do_not_wait_for_a_run(page: Page):
+def test_the_lines_for_a_shell_and_the_figures_of_a_record_do_not_wait_for_a_run(page: Page):
     data = {"kind": "simulate", "until": 200.0, "step": 0.01, "seed": 0}
     page.send("run", text=zakai.gallery.text("lorenz"), data=data, method="yau-yau")
     assert "zakai filter" in page.ask("shell", text=SPIRAL, data=SIMULATED)["text"]
+    assert page.ask("describe", text=SPIRAL, data=SIMULATED)["rows"] == 50
     page.send("cancel")
     while not page.receive().get("cancelled"):
         pass
