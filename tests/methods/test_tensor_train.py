@@ -78,6 +78,16 @@ def test_an_observation_eight_deviations_away_is_followed_and_reported():
     assert any("tail_depth" in words for words in result.warnings)
 
 
+def test_a_sharp_observation_finds_the_own_tails_of_a_bent_density():
+    model = zakai.Model(
+        state=["x", "y"], drift=["-0.4*x - 4.6*sin(1.5*y)", "-0.9*y - 1.6*cos(0.8*x)"], diffusion=[[0.7, 0], [0, 0.5]],
+        observation=["x + y/2"], observation_kind="samples", observation_noise=[[1e-3]],
+        prior={"kind": "gaussian", "mean": [-0.3, -0.3], "cov": [[0.4, 0.1], [0.1, 0.2]]},
+    )  # fmt: skip
+    for time, value in ((0.3, -2.0), (1.0, -1.0)):
+        near(model, zakai.Record([time], [[value]], "samples"), 1e-2)
+
+
 def test_all_modes_of_squares_are_kept_and_stay_symmetric():
     n = 4
     model = zakai.Model(

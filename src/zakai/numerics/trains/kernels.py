@@ -24,7 +24,7 @@ Array = Any
 PATH = types.Tuple((F2, F3))
 # Centre, inverse of the basis, low, step, sizes; periods (0 or 2 pi); ranks (n + 1,), offsets, coefficients (N + 2 PAD, a, b) of
 # each core; of the Gaussian that stands for the tails the mean less the centre, the inverse of a root of the covariance, and
-# [square of the radius where it begins, largest value].
+# [square of the radius where it begins, largest value, value at the radius].
 TRAIN = types.Tuple((F1, F2, F1, F1, I1, F1, I1, I1, F1, F1, F2, F1))
 # Ranks (n + 1,), sizes (n,), where each core begins (n,), and the cores in the order (N, a, b).
 PACKED = types.Tuple((I1, I1, I1, F1))
@@ -93,7 +93,7 @@ def add_train(train: Any, x: Array, moved: bool, scale: Array, out: Array) -> No
     for k in range(n):
         width, cells = max(width, ranks[k + 1]), max(cells, sizes[k] + 2 * PAD)
     w, c, y, s = np.empty(6), np.empty(TOGETHER * 6 * width), np.empty(n), np.empty((n, POINTS))
-    v, after = np.empty((POINTS, width)), np.empty(TOGETHER * width)
+    v, after, gaussian = np.empty((POINTS, width)), np.empty(TOGETHER * width), np.empty(POINTS)
     inside, alive, cell = np.empty(POINTS, np.bool_), np.empty(POINTS, np.int64), np.empty(POINTS, np.int64)
     starts, order = np.empty(cells + 1, np.int64), np.empty(POINTS, np.int64)
     for first in range(0, count, POINTS):
@@ -113,10 +113,9 @@ def add_train(train: Any, x: Array, moved: bool, scale: Array, out: Array) -> No
                 within = within and s[k, p] > -2.9 and s[k, p] < sizes[k] + 1.9
                 square += white * white
             inside[p] = within or square > tail[0]
-            v[p, 0] = 1.0
-            if square > tail[0]:
-                v[p, 0] = tail[1] * math.exp(-0.5 * square)
-            elif within:
+            v[p, 0] = 1.0 if within else 0.0
+            gaussian[p] = tail[1] * math.exp(-0.5 * square) if square > tail[0] else -1.0
+            if within:
                 alive[used] = p
                 used += 1
         for k in range(n):
@@ -150,7 +149,12 @@ def add_train(train: Any, x: Array, moved: bool, scale: Array, out: Array) -> No
                 begin = end
         for p in range(size):
             if inside[p]:
-                value = scale[0] * v[p, 0]
+                value = v[p, 0]
+                if gaussian[p] >= 0.0:  # the train from twice the value at the radius, the Gaussian below it, smoothly in between
+                    share = min(max(value / tail[2] - 1.0, 0.0), 1.0)
+                    share *= share * (3.0 - 2.0 * share)
+                    value = share * value + (1.0 - share) * gaussian[p]
+                value *= scale[0]
                 if moved:
                     value *= math.exp(min(x[n, first + p] - scale[1], LARGEST_LOG))
                 if value == value:

@@ -14,8 +14,9 @@ from zakai.numerics.trains.grid import Grid, after_noise, kernel_matrix, padded_
 from zakai.numerics.trains.kernels import add_train, draw, values_on_grid
 
 Array = Any
-# Share of the mass of a Gaussian beyond the radius from which it stands for the train.  There a train is below the error that it
-# has relative to its largest value: an observation six deviations away would find nothing but that error, and lose the density.
+# Share of the mass of a Gaussian beyond the radius from which it stands for the train where that is smaller than the Gaussian at
+# the radius.  There a train is below the error that it has relative to its largest value: an observation six deviations away would
+# find nothing but that error, and lose the density.  A density with more mass out there, as one that is bent, keeps its own values.
 TAIL = 1e-4
 SMALL = 1e-12  # variance of noise along an axis, in variances of the density, that is left out
 
@@ -74,7 +75,7 @@ class Train:
     def _tail(self) -> tuple[Array, Array, Array]:
         """The Gaussian with the moments of the train that stands for it where it is below its accuracy: see `TAIL`."""
         n, mass = self.grid.n, self.mass
-        none = np.zeros(n), np.zeros((n, n)), np.array([np.inf, 0.0])
+        none = np.zeros(n), np.zeros((n, n)), np.array([np.inf, 0.0, 1.0])
         if not self.tails or self.grid.closed.any() or not mass > 0:
             return none
         mean, P = self.moments()
@@ -83,7 +84,8 @@ class Train:
         except np.linalg.LinAlgError:
             return none
         top = mass * float(np.prod(np.diag(whitening))) / (2.0 * math.pi) ** (0.5 * n)
-        return mean - self.grid.centre, np.ascontiguousarray(whitening), np.array([tail_radius(n), top])
+        least = top * math.exp(-0.5 * tail_radius(n))
+        return mean - self.grid.centre, np.ascontiguousarray(whitening), np.array([tail_radius(n), top, least])
 
     @cached_property
     def _packed(self) -> tuple[Any, ...]:
