@@ -25,7 +25,7 @@ def begun(prepared: Prepared, function: Callable[[Array], Array], choice: Choice
     """Return the prior by a known build."""
     v = _built(prepared, function, choice)
     n = prepared.model.n
-    return State.of(v.scaled(1.0 / v.mass), Control(0, Substeps(0.0, 0, False, 0.0), np.zeros((n, n))))
+    return State.of(v.scaled(1.0 / v.mass), Control(0, Substeps(1.0, 0.0, 0, False, 0.0), np.zeros((n, n))))
 
 
 def step(chain: Chain, state: State, made: Made, figures: Sequence[str]) -> tuple[State, Info]:

@@ -104,7 +104,7 @@ def step(prepared: Prepared, k: int, later: Message, values: Array, state: State
     chain = Chain(prepared, prepared.interval(k), values, builder_of(prepared, state))
     rng, x, moments, unknown = _generator(control.interval, later.seed), later.draws, later.moments, 0.0
     try:
-        prediction, _, time = predicted(chain, state)
+        prediction, _, _, in_time = predicted(chain, state)
     except (Unresolved, np.linalg.LinAlgError):
         return later._replace(draws=np.full_like(x, np.nan), moments=None, error=math.nan, unknown=0.0, last=False)
     for move in reversed(chain.moves):
@@ -116,7 +116,7 @@ def step(prepared: Prepared, k: int, later: Message, values: Array, state: State
         x, unknown = led.draws, max(unknown, led.unknown)
     off_grid = sum(report.off_grid for report in chain.builder.reports)
     # The draws go by the finer substeps alone, which have GAIN / 3 times the error of what is extrapolated.
-    made = 0.5 * (off_grid + prediction.defect + GAIN / 3.0 * time.error)
+    made = 0.5 * (off_grid + prediction.defect + GAIN / 3.0 * in_time)
     return Message(_wrapped(prepared, x), moments, max(error_of(prepared, state), later.error, made), unknown, False, later.seed)
 
 

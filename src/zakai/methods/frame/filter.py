@@ -21,7 +21,7 @@ from zakai.methods.frame.build import CONTROLS, Builder, difference
 from zakai.methods.frame.chain import MOST_SUBSTEPS, Chain, Prediction, extrapolated
 from zakai.methods.frame.errors import carried, in_deviations, total
 from zakai.methods.frame.placement import Mass
-from zakai.methods.frame.state import Choice, Control, Made, Prepared, State, Substeps, Unresolved
+from zakai.methods.frame.state import LONGER, Choice, Control, Made, Prepared, State, Substeps, Unresolved
 from zakai.methods.frame.update import depth_of, update
 from zakai.methods.particles.programs import Array
 from zakai.methods.system.escape_of_states import RARE, check_escape
@@ -65,7 +65,7 @@ def init(prepared: Prepared, prior: Any) -> State:
     assert model.n == len(mass.points) and len(theta) == len(prepared.theta)
     _, P = mass.unwrapped(system.base.angles).moments()
     error = builder.missed.of_mean(np.zeros(len(builder.missed.relative)), P, system.base.angles)
-    control = Control(0, Substeps(0.0, -AUDIT, False, 0.0), error.square)
+    control = Control(0, Substeps(1.0, 0.0, -AUDIT, False, 0.0), error.square)
     return State.of(v.scaled(1.0 / v.mass), control)
 
 
@@ -188,7 +188,7 @@ def _step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[tupl
         return again.step(Chain(prepared, interval, values, Builder(prepared)), state, known, FIGURES), 0.0
     builder = builder_of(prepared, state)
     chain = Chain(prepared, interval, values, builder)
-    prediction, count, time = predicted(chain, state)
+    prediction, count, time, in_time = predicted(chain, state)
     likelihood = prepared.motion.likelihood(interval, values)
     updated = update(builder, prediction, likelihood)
     v, rule = updated.density, builder.rule
@@ -201,7 +201,7 @@ def _step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[tupl
     off_grid, edge = sum(report.off_grid for report in reports), max(report.edge for report in reports)
     # Far out a density is known relative to its largest value only; beyond, a Gaussian stands for it.
     far = min(IN_TAILS * rule.tolerance * math.exp(min(depth, 50.0)), BEYOND * math.sqrt(2.0 * max(depth, 0.0)))
-    new = math.hypot(OF_MEAN * (prediction.defect + edge + time.error), far)
+    new = math.hypot(OF_MEAN * (prediction.defect + edge + in_time), far)
     angles = prepared.system.base.angles
     parts = [
         (factor, missed.of_mean(prepared.motion.logs(likelihood, missed.mass.points), cov, angles))
@@ -223,7 +223,7 @@ def _step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[tupl
         "tail_depth": depth / math.log(1.0 / rule.tolerance),
         "powers": float(updated.powers),
         "substeps": float(count),
-        "time_error": time.error,
+        "time_error": in_time,
         "effective_share": updated.effective,
     }
     lost = max(chain.lost, prediction.defect)
@@ -241,21 +241,23 @@ def builder_of(prepared: Prepared, state: State) -> Builder:
     return Builder(prepared, error_of(prepared, state), state.control.looser)
 
 
-def predicted(chain: Chain, state: State) -> tuple[Prediction, int, Substeps]:
-    """Return the prediction over an interval, the number of its substeps, and how the next intervals are divided."""
+def predicted(chain: Chain, state: State) -> tuple[Prediction, int, Substeps, float]:
+    """Return the prediction over an interval, the number of its substeps, how the next ones are divided, and the error in time."""
     prepared, interval, time = chain.prepared, chain.interval, state.control.time
     length, number = interval.stop - interval.start, state.control.interval + 1
-    count = min(max(1, math.ceil(length * time.rate - 1e-9)), MOST_SUBSTEPS)
+    count = min(max(1, math.ceil(time.needed(length) - 1e-9)), MOST_SUBSTEPS)
     u = state.train(prepared.system.periods)
     prediction, count = chain.first(u, count)
     exact = prepared.system.base.affine and prepared.system.base.sampled and not prepared.system.base.driven
-    if length > 0 and not exact and (time.both or number - time.audited >= AUDIT):
+    if length > 0 and not exact and (time.both or length > LONGER * time.length or number - time.audited >= AUDIT):
         return _audited(chain, u, prediction, count, number)
-    return prediction, count, time
+    return prediction, count, time, time.left(length, count)
 
 
-def _audited(chain: Chain, u: Train, coarser: Prediction, count: int, number: int) -> tuple[Prediction, int, Substeps]:
-    """Return the prediction extrapolated from s and 2 s substeps, 2 s, and what their difference says of the next intervals."""
+def _audited(
+    chain: Chain, u: Train, coarser: Prediction, count: int, number: int
+) -> tuple[Prediction, int, Substeps, float]:
+    """Return the prediction extrapolated from s and 2 s substeps, 2 s, what their difference says of the next, and its error."""
     allowed, length = TIME_SHARE * chain.builder.allowed, chain.interval.stop - chain.interval.start
     while True:
         finer, more = chain.first(u, 2 * count)
@@ -270,9 +272,11 @@ def _audited(chain: Chain, u: Train, coarser: Prediction, count: int, number: in
     plain = 0.5 * more * max(0.5, math.sqrt(error / (SAFETY * allowed)))
     both = 0.5 * more * max(0.5, (error / (GAIN * SAFETY * allowed)) ** 0.25)
     extrapolate = plain > 3.0 * both
-    found = Substeps((both if extrapolate else plain) / length, number, extrapolate, error / GAIN)
+    left = 4.0 / 3.0 * error * (0.5 * more / plain) ** 2
+    found = Substeps(both if extrapolate else plain, length, number, extrapolate, left)
     extra = extrapolated(finer, coarser)
     motions = (*finer.motions, *coarser.motions)
     missed = [(4.0 / 3.0 * factor, part) for factor, part in finer.missed]
     missed += [(-1.0 / 3.0 * factor, part) for factor, part in coarser.missed]
-    return Prediction(extra, finer.mass, finer.log_mass, finer.defect, finer.slope, motions, tuple(missed)), more, found
+    both = Prediction(extra, finer.mass, finer.log_mass, finer.defect, finer.slope, motions, tuple(missed))
+    return both, more, found, error / GAIN

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
@@ -17,21 +18,35 @@ from zakai.numerics.trains.grid import Grid
 from zakai.numerics.trains.train import Train
 from zakai.records.schedule import Schedule
 
+# Ratio of an interval's length to that of the last comparison of s and 2 s substeps, from which another one is made: in a long
+# interval a density is wider, and its substeps have other errors than in a short one.
+LONGER = 2.0
+
 
 class Unresolved(ArithmeticError):
     """A density that no grid holds: the substep is too long, or the density was lost."""
 
 
 class Substeps(NamedTuple):
-    """How an interval is divided: substeps per unit time, and whether s and 2 s are extrapolated in every interval.
+    """How intervals are divided, by the last comparison of s and 2 s substeps, in the interval `audited`.
 
-    `audited` is the interval of the last comparison of s and 2 s, and `error` the error in L1 that it left.
+    `count` substeps leave the `error` in L1 in an interval of that `length`; with `both`, s and 2 s are extrapolated every time.
     """
 
-    rate: float
+    count: float
+    length: float
     audited: int
     both: bool
     error: float
+
+    def needed(self, length: float) -> float:
+        """Return how many substeps an interval needs: with c `length` d^2 as the error of substeps of length d, for long ones."""
+        ratio = length / self.length if self.length > 0 else 0.0
+        return self.count * ratio * math.sqrt(min(max(ratio, 1.0), LONGER))
+
+    def left(self, length: float, count: int) -> float:
+        """Return the error that so many substeps leave in an interval."""
+        return self.error * (length / self.length) ** 3 * (self.count / count) ** 2 if self.length > 0 else 0.0
 
 
 class Control(NamedTuple):
