@@ -89,8 +89,8 @@ def measured(found: Case, method: str, tolerance: float) -> Row:
         begin = time.process_time()
         try:
             result = zakai.filter(model, record, method, tolerance=tolerance, keep="moments")
-        except zakai.ZakaiError as error:
-            return Row(np.nan, np.nan, np.nan, np.nan, 0, str(error)[:200])
+        except zakai.ZakaiError as refusal:
+            return Row(np.nan, np.nan, np.nan, np.nan, 0, str(refusal)[:200])
         took.append(1e3 * (time.process_time() - begin) / len(record.times))
     moments = np.column_stack([result.mean[1:], result.variance[1:], result.log_likelihood_increments[1:]])
     error, estimate = difference(moments, found.moments, model), np.asarray(result.error_estimate[1:])
@@ -120,18 +120,17 @@ def main() -> None:
             for method in args.methods:
                 row = measured(found, method, args.tolerance)
                 rows[method].append(row)
-                figures = f"{row.took:8.2f} ms, error {row.error:.1e}, estimate {row.estimate:.1e}, error / estimate {row.excess:.2g}"
+                figures = f"{row.took:8.2f} ms, error {row.error:.1e}, estimate {row.estimate:.1e}, ratio {row.excess:.2g}"
                 print(f"  {method:14}{row.refusal or figures}{f', {row.warned} warn' if row.warned else ''}", flush=True)
         seed += 1
     first = np.array([row.took for row in rows[args.methods[0]]])
     for method, own in rows.items():
         error, took = np.array([row.error for row in own]), np.array([row.took for row in own])
-        print(
-            f"{method}: {sum(bool(row.refusal) for row in own)} refused, {sum(row.warned > 0 for row in own)} warned, error median "
-            f"{np.nanmedian(error):.1e} largest {np.nanmax(error):.1e}, {sum(row.excess > 3 for row in own)} above three estimates, "
-            f"time median {np.nanmedian(took):.1f} ms, over {args.methods[0]}: median {np.nanmedian(took / first):.2f}, smallest "
-            f"{np.nanmin(took / first):.2f}, at most half in {np.sum(took <= 0.5 * first)}"
-        )
+        refused, warned = sum(bool(row.refusal) for row in own), sum(row.warned > 0 for row in own)
+        print(f"{method}: {refused} refused, {warned} warned, {sum(row.excess > 3 for row in own)} silent above three estimates")
+        print(f"  error median {np.nanmedian(error):.1e}, largest {np.nanmax(error):.1e}; {np.nanmedian(took):.1f} ms")
+        ratio = took / first
+        print(f"  time over {args.methods[0]}: median {np.nanmedian(ratio):.2f}, from {ratio.min():.2f} to {ratio.max():.2f}")
 
 
 if __name__ == "__main__":

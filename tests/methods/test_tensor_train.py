@@ -135,6 +135,15 @@ def test_noise_that_depends_on_the_state_agrees_with_a_grid():
     near(model, record, 2e-2)
 
 
+def test_an_interval_longer_than_the_first_has_substeps_of_its_own():
+    model = zakai.Model(
+        state=["x", "y"], drift=["-0.9*x + 2.2*tanh(x - 0.5*y)", "-0.9*y - 1.7*tanh(0.7*x)"], diffusion=[[0.8, 0], [0, 0.5]],
+        observation=["x - x**3/5", "x + y/2"], observation_kind="increments", observation_noise=[[1.5, 0], [0, 0.07]],
+        prior={"kind": "gaussian", "mean": [0.2, -0.2], "cov": [[0.1, 0.0], [0.0, 0.1]]},
+    )  # fmt: skip
+    near(model, zakai.Record([0.3, 2.6], [[0.0, 0.05], [1.0, 2.5]], "increments"), 4e-4)
+
+
 def test_increments_of_a_nonlinear_sensor_agree_with_a_grid():
     model = zakai.Model(
         state=["x", "y"], drift=["cos(x) + 0.5*sin(y)", "cos(y)"], diffusion=[[1, 0], [0, 1]], observation=["x**3", "y**3"],

@@ -242,7 +242,7 @@ def builder_of(prepared: Prepared, state: State) -> Builder:
 
 
 def predicted(chain: Chain, state: State) -> tuple[Prediction, int, Substeps, float]:
-    """Return the prediction over an interval, the number of its substeps, how the next ones are divided, and the error in time."""
+    """Return the prediction over an interval, the number of its substeps, how the next are divided, and the error in time."""
     prepared, interval, time = chain.prepared, chain.interval, state.control.time
     length, number = interval.stop - interval.start, state.control.interval + 1
     count = min(max(1, math.ceil(time.needed(length) - 1e-9)), MOST_SUBSTEPS)
