@@ -30,23 +30,23 @@ class Unresolved(ArithmeticError):
 class Substeps(NamedTuple):
     """How intervals are divided, by the last comparison of s and 2 s substeps, in the interval `audited`.
 
-    `count` substeps leave the `error` in L1 in an interval of that `length`; with `both`, s and 2 s are extrapolated every time.
+    So many `substeps` leave the `error` in L1 in an interval of that `length`; with `both`, s and 2 s are always extrapolated.
     """
 
-    count: float
+    substeps: float
     length: float
     audited: int
     both: bool
     error: float
 
     def needed(self, length: float) -> float:
-        """Return how many substeps an interval needs: with c `length` d^2 as the error of substeps of length d, for long ones."""
+        """Return how many substeps an interval needs; substeps of length d have an error in proportion to `length` d^2."""
         ratio = length / self.length if self.length > 0 else 0.0
-        return self.count * ratio * math.sqrt(min(max(ratio, 1.0), LONGER))
+        return self.substeps * ratio * math.sqrt(min(max(ratio, 1.0), LONGER))
 
     def left(self, length: float, count: int) -> float:
         """Return the error that so many substeps leave in an interval."""
-        return self.error * (length / self.length) ** 3 * (self.count / count) ** 2 if self.length > 0 else 0.0
+        return self.error * (length / self.length) ** 3 * (self.substeps / count) ** 2 if self.length > 0 else 0.0
 
 
 class Control(NamedTuple):

@@ -24,4 +24,4 @@ def valid(prepared: Prepared, state: State) -> bool:
     closed = np.asarray(state.closed)
     if closed.dtype != bool or (closed & ~prepared.system.base.angles).any() or not (np.asarray(state.step) > 0).all():
         return False
-    return bool(abs(np.linalg.det(state.basis)) > 0 and state.control.interval >= 0 and np.isfinite(state.control.time.count))
+    return bool(abs(np.linalg.det(state.basis)) > 0 and state.control.interval >= 0 and np.isfinite(state.control.time.substeps))
