@@ -278,5 +278,5 @@ def _audited(
     motions = (*finer.motions, *coarser.motions)
     missed = [(4.0 / 3.0 * factor, part) for factor, part in finer.missed]
     missed += [(-1.0 / 3.0 * factor, part) for factor, part in coarser.missed]
-    both = Prediction(extra, finer.mass, finer.log_mass, finer.defect, finer.slope, motions, tuple(missed))
-    return both, more, found, error / GAIN
+    answer = Prediction(extra, finer.mass, finer.log_mass, finer.defect, finer.slope, motions, tuple(missed))
+    return answer, more, found, error / GAIN
