@@ -177,11 +177,11 @@ class Motion:
             P = base.precision(t, interval.inside, self.theta, u)
         G = coefficients.covariance(t, P, u)
         if base.affine and base.cross is None:
-            return noise_about_middle(coefficients.constant_matrix[None], G[None], length)[0]
+            return noise_about_middle(coefficients.constant_matrix, G, length)
         # The value at the interval's end is the limit from inside, as for the flows.
         given = self.path(interval, t, t + 1e-9 * length, values, 1).given[0, 0]
         mean, scale = about
-        return noise_about_middle(coefficients.matrices(mean[None], scale, t, given), G[None], length)[0]
+        return noise_about_middle(coefficients.matrix(mean, scale, t, given), G, length)
 
     def kicks(self, interval: Interval, t: float, length: float) -> list[Array]:
         """Return the coefficients of the fields g (r,) for one deviation of each noise of a substep, in order."""

@@ -84,7 +84,7 @@ def drawn(prepared: Prepared, state: State) -> State:
     particles = state.particles[:n].copy()
     particles[list(system.block.linear)] += np.einsum("pij,pj,jp->ip", vectors, np.sqrt(np.maximum(values, 0.0)), noise)
     reduced = particle_filter.reduced(state)
-    known = {"shift": state.shift[:n], "last_shift": state.last_shift[:n], "last_scale": state.last_scale[:n]}
+    known = {"shift": state.shift, "last_shift": state.last_shift[:n], "last_scale": state.last_scale[:n]}
     return reduced._replace(particles=particles, **known)
 
 

@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from zakai.methods._protocol import Info
-from zakai.methods.particles.errors import CAUTION, DEPTH, FEW_FAMILIES, Genealogy, Weighted, of_log_likelihood, variances
+from zakai.methods.particles.errors import CAUTION, FEW_FAMILIES, Genealogy, of_log_likelihood, variances
 from zakai.methods.particles.interval import (
     MOST_SUBSTEPS,
     MOST_TIME_ERROR,
@@ -34,7 +34,6 @@ from zakai.methods.particles.interval import (
     Pilots,
     Scheme,
     Steps,
-    carried_shift,
     steps_of,
     with_update,
 )
@@ -43,11 +42,10 @@ from zakai.methods.particles.programs import Array
 from zakai.methods.particles.state import Cloud, Control, Prepared, Rule, State
 from zakai.methods.particles.window import Target, Window, taken
 from zakai.methods.system.escape_of_states import RARE, check_escape
-from zakai.numerics.particles.chunks import over_chunks
-from zakai.numerics.particles.population import effective, next_power, normalised, systematic
+from zakai.numerics.particles.population import DEPTH, effective, next_power, normalised, systematic, weigh
 from zakai.numerics.particles.random import normals, uniform_number
 
-NOISE, RESAMPLING, PILOT, GUIDE, MOVE, PRIOR, LEVELS, CARRY = range(8)  # uses of random numbers
+NOISE, RESAMPLING, PILOT, GUIDE, MOVE, PRIOR, LEVELS = range(7)  # uses of random numbers
 RESAMPLE_BELOW = 0.5  # effective share of the particles
 GUIDE_BELOW = 0.3  # effective share below which the noise is drawn again from the linearised posterior
 TEMPER_BELOW, TEMPER_FLOOR = 0.1, 400  # effective share and number below which powers of the likelihood are taken
@@ -56,7 +54,6 @@ GUIDE_SHARE, FIRST_SHARE = 0.1, 0.2  # of plain noise in draws from the linearis
 FIRST_WIDER, FIRST_ROUNDS = 1.5, 6
 INFORMED = 0.25  # log det of the linearised posterior of the noise, below which the observation says nothing about the noise
 MOST_LEVELS = 60
-FAR = 1e100  # a state that has left every bounded set
 # The past is moved where that pays: by error^2 x time, with N variance of a mean, in variances of the state, as error^2.  What
 # ancestors add to that, beyond what the last move left, is taken away from later steps, and as the ancestors that are lost before
 # a move cannot come back, `MOVE_WORTH` times as much as has added up since the last one counts (error^2 x time of eleven systems
@@ -75,7 +72,6 @@ REPEATED, NARROWEST = 2.0, 0.02  # excess of the time error at which an interval
 # up to which it holds.  It does not where the drift moves the mean by more than a deviation in the interval, and so many times as
 # fast as where it was measured.
 SURE, TRUSTED, MOST_TRUSTED, FORESEEN, LONGER, FASTER = 0.5, 4, 8, 1.3, 4.0, 2.0
-CARRIED = 64  # particles by which a shift of the mean is carried through an interval
 
 
 def init(prepared: Prepared, prior: Any) -> State:
@@ -100,9 +96,9 @@ def _at_start(prepared: Prepared, particles: Array, first: Array, gaussian: tupl
     system, count = prepared.system, particles.shape[1]
     width = system.law.width if system.law is not None else system.factor.width  # type: ignore[union-attr]
     window = Window.begin(particles, first, gaussian, (width, len(prepared.motion.law[3])))
-    logs, nothing = np.full(count, -np.log(count)), np.zeros(system.n)
-    genealogy, control = Genealogy.begin(count, prepared.model.n), Control(variance=VARIANCE)
-    return State(particles, logs, window, genealogy, control, nothing, nothing, np.ones(system.n))
+    logs, n = np.full(count, -np.log(count)), prepared.model.n
+    genealogy, control = Genealogy.begin(count, n), Control(variance=VARIANCE)
+    return State(particles, logs, window, genealogy, control, np.zeros(n), np.zeros(system.n), np.ones(system.n))
 
 
 def reduced(state: State) -> State:
@@ -115,13 +111,14 @@ def reduced(state: State) -> State:
 class Advanced(NamedTuple):
     """Particles after an interval, with what was needed.
 
-    `gained` is the increment of the log-likelihood, `noise` (D, N) that of the interval, `predicted` (n',) the spread of the
+    `weights` (N,) are those of the particles, `gained` is the increment of the log-likelihood, `noise` (D, N) that of the interval, `predicted` (n',) the spread of the
     coordinates before the weights of the observation act, `deviations` (n,) those of the states before it, `acceptance` that of
     moves between powers of the likelihood; the next one is the share of the particles that left every bounded set, and `unseen`
     says that few particles are left by an observation that says nothing of the noise.
     """
 
     cloud: Cloud
+    weights: Array
     gained: float
     noise: Array
     predicted: Array
@@ -150,20 +147,17 @@ FIGURES = (
 
 
 def _step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[State, Info]:
-    def at_start() -> tuple[Array, Array]:
-        n, weights = prepared.model.n, np.exp(state.log_weights)
-        mean = state.particles @ weights
-        apart = (state.particles - mean[:, None])[:n]
-        return mean[:n], system.widened(mean, apart * weights @ apart.T)
+    system, n, weights = prepared.system, prepared.model.n, np.exp(state.log_weights)
+    before = moments_of(system, state.particles, weights)
 
-    system = prepared.system
+    def at_start() -> tuple[Array, Array]:
+        return before.mean[:n], before.cov
+
     check_escape(prepared, k, at_start, infinity=False)
     motion, interval, control = prepared.motion, prepared.interval(k), state.control
-    number, rule, n = control.interval + 1, prepared.rule, prepared.model.n
+    number, rule = control.interval + 1, prepared.rule
     cloud = Cloud(state.particles, state.log_weights, state.window, state.genealogy)
-    weights = np.exp(cloud.logs)
-    before, apart, cov, _ = moments_of(system, cloud.particles, weights)
-    scale, began = np.maximum(system.scales(cov), 1e-12), Weighted(apart, weights)
+    scale = np.maximum(system.scales(before.cov), 1e-12)
     observed = _observed(prepared, interval, values)
     wanted, size = _wanted(rule, len(weights), control.variance), effective(weights)
     if size < HOPELESS * len(weights):  # more of them would be of no use
@@ -173,10 +167,10 @@ def _step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[Stat
     start, narrow = cloud, control.narrow
     for last_turn in (False, True):
         # Errors are measured in deviations after the observation, by how much the last one, or this one, has narrowed them.
-        steps, control = _steps(prepared, interval, values, state, (before, narrow * scale))
-        events = with_update(motion.events(interval, steps.scheme, values, before, scale), system, observed)
+        steps, control = _steps(prepared, interval, values, state, (before.mean, narrow * scale))
+        events = with_update(motion.events(interval, steps.scheme, values, before.mean, scale), system, observed)
         done = _advanced(prepared, start, events, observed, number)
-        after = moments_of(system, done.cloud.particles, np.exp(done.cloud.logs))
+        after = moments_of(system, done.cloud.particles, done.weights)
         found_narrow = _narrowing(after.cov, done.deviations)
         if last_turn or steps.error * narrow <= REPEATED * _allowed(control, len(weights)) * found_narrow:
             break
@@ -186,14 +180,14 @@ def _step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[Stat
         check_escape(prepared, k, at_start)
     cloud = done.cloud
     # Of many coordinates the states at the end are not kept: an interval is run again when it leaves the window.
-    end = cloud.particles if system.n <= 2 * n else np.zeros((0, 0))
-    cloud = cloud._replace(window=cloud.window.appended(motion, events, observed, done.noise, end))
-    weights = np.exp(cloud.logs)
+    ends = cloud.particles if system.n <= 2 * n else np.zeros((0, 0))
+    cloud = cloud._replace(window=cloud.window.appended(motion, events, observed, done.noise, ends))
+    weights, cov = done.weights, after.cov
     size, largest = effective(weights), float(weights.max())
-    mean, deviations, cov, own = after
-    found, now = variances(cloud.genealogy, weights, deviations), Weighted(deviations, weights)
-    genealogy, variance = cloud.genealogy.carried(state.genealogy.age, began, now).seen(found, now)
-    cloud = cloud._replace(genealogy=genealogy)
+    found = variances(cloud.genealogy, after.particles)
+    genealogy, T = cloud.genealogy.carried(state.genealogy.age, before.particles, after.particles)
+    genealogy, variance = genealogy.seen(found, after.particles)
+    cloud, end = cloud._replace(genealogy=genealogy), after
     doubtful = size < TEMPER_BELOW * len(weights) or done.levels > 3
     acceptance, moved = done.acceptance, 0.0
     loss, own_loss = (_loss(part, cov, len(weights)) for part in (found.largest, found.means[0]))
@@ -209,30 +203,30 @@ def _step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[Stat
     if loss > MOVE_GAIN * (own_loss + floor) and worth * work > cost * losses and cloud.window.width:
         cloud, acceptance, doubtful_move = _moved(prepared, cloud, weights, number)
         weights = np.exp(cloud.logs)
-        mean, deviations, cov, own = moments_of(system, cloud.particles, weights)
-        genealogy, began, now = cloud.genealogy, now, Weighted(deviations, weights)
-        found = variances(genealogy, weights, deviations)
+        end, genealogy = moments_of(system, cloud.particles, weights), cloud.genealogy
         if len(cloud.window.first) and not doubtful_move:
             genealogy = genealogy.renewed()
-        genealogy, variance = genealogy.carried(genealogy.age - 1, began, now).seen(found, now)
+        found, cov = variances(genealogy, end.particles), end.cov
+        genealogy, _ = genealogy.carried(genealogy.age - 1, after.particles, end.particles)
+        genealogy, variance = genealogy.seen(found, end.particles)
         excess, present, work, moved, rate = 0.0, 0.0, work + cost, 1.0, acceptance
         remains = _loss(found.largest, cov, len(weights))
         floor = (remains - _loss(found.means[0], cov, len(weights))) * max(1.0, MOVE_GAIN * remains / loss) ** 2
         doubtful = doubtful or doubtful_move
-    spread = np.sqrt(np.maximum(np.diag(cov), 0.0))
     # What the weights say of a coordinate makes a shift of the prediction smaller by the ratio of the variances.
-    contraction = np.where(done.predicted > 0, np.minimum(1.0, own / np.maximum(done.predicted, 1e-300)) ** 2, 1.0)
-    shift = (_carried(prepared, events, state) if state.shift.any() else 0.0) + steps.shift
+    contraction = np.where(done.predicted > 0, np.minimum(1.0, end.spread / np.maximum(done.predicted, 1e-300)) ** 2, 1.0)[:n]
+    carried, fresh = T @ state.shift, steps.shift[:n]
+    predicted = carried / np.maximum(contraction, NARROWEST**2) + fresh
     # A shifted prediction changes the log density of an observation by the shift times an innovation.
-    spreads = np.maximum(done.deviations, 1e-300)
-    shifted = control.shifted + float(((shift[:n] / spreads) ** 2 * (1.0 - contraction[:n])).max())
-    shift = shift * contraction
+    shifts = (predicted / np.maximum(done.deviations, 1e-300)) ** 2 * (1.0 - contraction)
+    shifted, shift = control.shifted + float(shifts.max()), carried + contraction * fresh
     genealogy, evidence = of_log_likelihood(genealogy, found)
     cloud, evidence = cloud._replace(genealogy=genealogy), evidence + shifted
+    spread = end.deviations
     positive = np.where(spread > 0, spread, np.inf)
     share, random_error = found.largest / positive**2, float(np.sqrt((variance / positive**2).max()))
     until = cloud.genealogy.age + DEPTH if doubtful else control.doubtful_until
-    marked = doubtful or genealogy.age < until or found.families[-2] < FEW_FAMILIES or not genealogy.forgotten(now)
+    marked = doubtful or genealogy.age < until or found.families[-2] < FEW_FAMILIES or not found.forgotten(end.particles)
     health = {
         "effective_sample_size": size,
         "particles": float(len(weights)),
@@ -240,7 +234,7 @@ def _step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[Stat
         "largest_weight": largest,
         "tempering_levels": float(done.levels),
         "acceptance": acceptance,
-        "time_error": float((np.abs(shift[:n]) / positive).max()),
+        "time_error": float((np.abs(shift) / positive).max()),
         "monte_carlo_error": random_error,
         "log_likelihood_error": float(np.sqrt(evidence)),
         "lower_bound": float(marked),
@@ -249,7 +243,7 @@ def _step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[Stat
         "moved": moved,
         "linear_states": float(system.linear),
     }
-    info = Info(done.gained, mean[:n], cov, health, np.sqrt(variance + shift[:n] ** 2), float(np.sqrt(evidence)))
+    info = Info(done.gained, end.mean[:n], cov, health, np.sqrt(variance + shift**2), float(np.sqrt(evidence)))
     control = control._replace(
         interval=number, narrow=found_narrow, losses=losses, work=work, excess=excess, floor=floor, rate=rate,
         doubtful_until=until, shifted=shifted, present=present, known=known, remembered=remembered,
@@ -299,13 +293,6 @@ def _steps(
     )
 
 
-def _carried(prepared: Prepared, events: Events, state: State) -> Array:
-    """Return what the shift of the mean (n,) becomes in an interval."""
-    chosen = np.empty(CARRIED, np.int32)
-    systematic(np.exp(state.log_weights), uniform_number(prepared.key(state.control.interval + 1, CARRY)), chosen)
-    return carried_shift(prepared.motion, events, taken(state.particles, chosen), state.shift)
-
-
 def _observed(prepared: Prepared, interval: Interval, values: Array) -> Observed:
     """Return what the law of the observations at the end of an interval receives."""
     system, theta, t = prepared.system, prepared.theta, interval.stop
@@ -325,40 +312,30 @@ def _observed(prepared: Prepared, interval: Interval, values: Array) -> Observed
 
 def _advanced(prepared: Prepared, cloud: Cloud, events: Events, observed: Observed, number: int) -> Advanced:
     """Return the particles after an interval and its observation."""
-    motion, count = prepared.motion, len(cloud.logs)
-    noise = np.empty((events.width, count))
-    key = prepared.key(number, NOISE)
-    over_chunks(lambda low, high: normals(key, low, high, noise), count)
-    ends = None if prepared.system.update is None else np.empty((1, *cloud.particles.shape))
-    particles, gained = motion.advanced(events, cloud.particles, noise, ends)
-    seen = particles if ends is None else ends[0]  # before the update
-    lost = ~(np.abs(particles) < FAR).all(axis=0)  # NaN, too
-    if lost.any():
-        particles[:, lost] = cloud.particles[:, lost]
-        seen[:, lost] = cloud.particles[:, lost]
+    system, count = prepared.system, len(cloud.logs)
+    single = (np.array([observed.time]), observed.given[None], observed.counted[None])
+    target = Target(prepared.motion, events, *single, None, cloud.particles)
+    (noise, particles, seen, logs), lost = target.propagate(prepared.key(number, NOISE), system.update is not None)
     weights = np.exp(cloud.logs)
-    moved = moments_of(prepared.system, particles, weights)
-    before = moved if ends is None else moments_of(prepared.system, seen, weights)
-    spreads = moved.spread, np.sqrt(np.maximum(np.diag(before.cov), 0.0))
-    if prepared.system.sampled and not observed.counted.any() and not lost.any():
-        return Advanced(cloud._replace(particles=particles), 0.0, noise, *spreads)
-    share = float(lost.mean())
-    logs = gained + _log_likelihood(motion, seen, observed)
-    logs[lost | np.isnan(logs)] = -np.inf
-    weights, top = normalised(cloud.logs + logs)
-    plain = Advanced(cloud._replace(particles=particles, logs=cloud.logs + logs - top), top, noise, *spreads, lost=share)
+    moved = moments_of(system, particles, weights)
+    before = moments_of(system, seen, weights) if len(seen) else moved
+    spreads = moved.spread, before.deviations
+    if system.sampled and not observed.counted.any() and not lost:
+        return Advanced(cloud._replace(particles=particles), weights, 0.0, noise, *spreads)
+    weights = np.empty(count)
+    top = weigh(cloud.logs, logs, weights)
+    after = cloud._replace(particles=particles, logs=cloud.logs + logs - top)
+    plain = Advanced(after, weights, top, noise, *spreads, lost=lost / count)
     if effective(weights) >= GUIDE_BELOW * count and np.isfinite(top):
         return plain
     moving = cloud.window.length == 0 and len(cloud.window.first) > 0
-    prior = (cloud.window.mean, cloud.window.root) if moving else None
-    single = (np.array([observed.time]), observed.given[None], observed.counted[None])
-    target = Target(motion, events, *single, prior, cloud.particles)
+    target = replace(target, prior=(cloud.window.mean, cloud.window.root) if moving else None)
     first = np.concatenate([cloud.window.first, noise]) if moving else noise
     gaussian = _linearised(target, cloud, plain)
     if gaussian is not None and not moving and not np.isinf(top) and _uninformed(gaussian, 1.0):
         return plain._replace(unseen=True)  # moves of noise of which the observation says nothing would be of no use
     best = (gaussian and _guided(prepared, target, cloud, plain, gaussian, number)) or Drawn(plain, first, logs, None)
-    size = effective(np.exp(best.after.cloud.logs)) if np.isfinite(best.after.gained) else 0.0
+    size = effective(best.after.weights) if np.isfinite(best.after.gained) else 0.0
     if size >= min(TEMPER_BELOW * count, TEMPER_FLOOR) or not np.isfinite(best.logs).any():
         return best.after
     return _tempered(prepared, target, cloud, best, number)
@@ -382,14 +359,6 @@ def _narrowing(cov: Array, before: Array) -> float:
     wide = before > 0
     ratios = np.sqrt(np.maximum(np.diag(cov), 0.0))[wide] / before[wide]
     return float(np.clip(np.nanmin(ratios, initial=1.0), NARROWEST, 1.0))
-
-
-def _log_likelihood(motion: Motion, particles: Array, observed: Observed) -> Array:
-    """Return log p(z | x) (N,), -inf where there is no law."""
-    if not observed.counted.any():
-        return np.zeros(particles.shape[1])
-    terms = motion.values(motion.law, particles, observed.time, observed.given)
-    return np.asarray(terms[observed.counted > 0].sum(axis=0))
 
 
 def _linearised(target: Target, cloud: Cloud, plain: Advanced) -> Any:
@@ -420,11 +389,11 @@ def _guided(
     particles[:, lost] = plain.cloud.particles[:, lost]
     logs[lost | np.isnan(logs)] = -np.inf
     found, top = normalised(cloud.logs + logs)
-    if not np.isfinite(top) or np.isfinite(plain.gained) and effective(found) <= effective(np.exp(plain.cloud.logs)):
+    if not np.isfinite(top) or np.isfinite(plain.gained) and effective(found) <= effective(plain.weights):
         return None
     window = cloud.window._replace(first=np.ascontiguousarray(path[:d0])) if moving else cloud.window
     after = Cloud(particles, cloud.logs + logs - top, window, cloud.genealogy)
-    done = plain._replace(cloud=after, gained=top, noise=np.ascontiguousarray(path[d0:]), guided=True)
+    done = plain._replace(cloud=after, weights=found, gained=top, noise=np.ascontiguousarray(path[d0:]), guided=True)
     return Drawn(done, path, logs, gaussian)
 
 
@@ -453,7 +422,8 @@ def _tempered(prepared: Prepared, target: Target, cloud: Cloud, drawn: Drawn, nu
     window = cloud.window._replace(first=np.ascontiguousarray(path[:d0])) if moving else cloud.window
     after = Cloud(particles, cloud.logs, window, cloud.genealogy)
     noise, guided = np.ascontiguousarray(path[d0:]), fixed is not None
-    return Advanced(after, gained, noise, *drawn.after[3:5], levels, guided, float(np.mean(rates)), drawn.after.lost)
+    spreads, weights = (drawn.after.predicted, drawn.after.deviations), np.exp(cloud.logs)
+    return Advanced(after, weights, gained, noise, *spreads, levels, guided, float(np.mean(rates)), drawn.after.lost)
 
 
 def _loss(variance: Array, cov: Array, count: int) -> float:

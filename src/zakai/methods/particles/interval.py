@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.linalg import expm
 
 from zakai.methods.particles.programs import Array, Expressions
 from zakai.methods.particles.system import System, roots
 from zakai.numerics.particles.chunks import over_chunks
 from zakai.numerics.particles.formulas import evaluate
+from zakai.numerics.particles import noise as noise_kernels
 from zakai.numerics.particles.motion import ADDITIVE, ORDERED, UPDATE, Arrival, advance
 from zakai.numerics.particles.random import key_of, normals
+from zakai.numerics.particles.step_errors import StepErrors, step_errors
 from zakai.records.inputs import Inputs
 
 PILOTS = 128  # particles by which the time step is measured
@@ -24,11 +26,6 @@ TIME_ERROR, OF_RANDOM_ERROR, MOST_TIME_ERROR = 0.005, 0.1, 0.1
 MOST_SUBSTEPS = 64
 LEAST_CONTRACTION = 0.02  # ratio of deviations at the end and the start of an interval, below which errors are not judged by it
 EXACT = 1e-3  # relative error of the flow of an affine system without time that is not measured
-KEPT_LENGTHS = 64  # of substeps whose noise is kept
-# Norm of df/dx times a substep above which it is reduced where f is not linear: noise that is carried far to the middle of a
-# substep is amplified there, and a nonlinear flow does not take that back.
-_CARRIED = 2.0
-_SERIES = 4.0  # norm of A times the substep up to which the covariance of its noise is a series
 
 
 class Interval(NamedTuple):
@@ -64,6 +61,14 @@ class Events(NamedTuple):
     def width(self) -> int:
         """The number of standard normal numbers of a particle."""
         return int(self.rows[-1].sum()) if len(self.rows) else 0
+
+
+class Flows(NamedTuple):
+    """The times, the places and the given numbers of events."""
+
+    times: Array
+    places: Array
+    given: Array
 
 
 class Observed(NamedTuple):
@@ -137,20 +142,6 @@ class Motion:
         over_chunks(lambda low, high: evaluate(program, self.system.box, x, t, given, low, high, out), x.shape[1])
         return out
 
-    @cached_property
-    def _kept_roots(self) -> dict[float, Array]:
-        return {}
-
-    def _root_of(self, step: float) -> Array:
-        """Return the root of the noise of a substep of an affine system without time."""
-        if step not in self._kept_roots:
-            if len(self._kept_roots) >= KEPT_LENGTHS:
-                self._kept_roots.clear()
-            nothing = np.zeros((self.system.m, self.system.m))
-            G = self.covariance(float(self.system.model.start), nothing, None)
-            self._kept_roots[step] = roots(noise_about_middle(self.constant_matrix[None], G[None], step))[0]
-        return self._kept_roots[step]
-
     def covariance(self, t: float, P: Array, u: Array | None) -> Array:
         """Return g (Q - C P C') g' (n, n) for noise that does not depend on the state."""
         system = self.system
@@ -169,19 +160,14 @@ class Motion:
     @cached_property
     def constant_matrix(self) -> Array:
         """The matrix of an affine drift."""
-        model = self.system.model
-        given = np.zeros(self.system.drift.width)
-        return np.asarray(self.matrices(np.zeros((1, model.n)), np.ones(model.n), float(model.start), given)[0])
+        n = self.system.model.n
+        return self.matrix(np.zeros(n), np.ones(n), float(self.system.model.start), np.zeros(self.system.drift.width))
 
-    def matrices(self, x: Array, scale: Array, t: float, given: Array) -> Array:
-        """Return df/dx (J, n, n) at points (J, n), by forward differences."""
-        count, n = x.shape
-        step = 1e-5 * scale
-        points = np.repeat(x.T[:, :, None], n + 1, axis=2)
-        points[np.arange(n), :, np.arange(1, n + 1)] += step[:, None]
-        f = self.values(self.arrays[0], points.reshape(n, -1), t, given)[:n].reshape(n, count, n + 1)
-        found = ((f[:, :, 1:] - f[:, :, :1]) / step).transpose(1, 0, 2)
-        return np.where(np.isfinite(found), found, 0.0)
+    def matrix(self, x: Array, scale: Array, t: float, given: Array) -> Array:
+        """Return df/dx (n, n) at a point (n,), by forward differences."""
+        found = np.empty((len(x), len(x)))
+        noise_kernels.slopes(self.arrays[0], self.system.box, x, scale, t, given, found)
+        return found
 
     def pace(self, interval: Interval, values: Array, mean: Array, scale: Array) -> float:
         """Return the largest drift of a mean (n,) at the start of an interval, in deviations (n,) by time."""
@@ -206,18 +192,24 @@ class Motion:
             row = np.array([[start, start]])
             return Events(row, np.array([[-1, 0, 4]]), np.zeros((1, 2, system.drift.width)), none, np.zeros((0, 3), np.int64))
         step = length / count
-        kicks = start + (np.arange(count) + 0.5) * step
-        jumps = np.zeros(0) if interval.inputs is None else interval.inputs.within(start, stop)
-        ends = np.unique(np.concatenate([kicks, jumps, [stop]]))
-        times = np.column_stack([np.append(start, ends[:-1]), ends])
-        kicked = np.searchsorted(kicks, ends)
-        kicked = np.where((kicked < count) & (kicks[np.minimum(kicked, count - 1)] == ends), kicked, -1)
-        places = np.column_stack([kicked, np.where(ends == stop, 0, -1), np.full(len(ends), scheme.stages)]).astype(np.int64)
+        ends = np.append(start + (np.arange(count) + 0.5) * step, stop)
+        places = np.full((count + 1, 3), -1)
+        places[:count, 0], places[count, 1] = np.arange(count), 0
+        if interval.inputs is not None:
+            jumps = interval.inputs.within(start, stop)
+            order = np.argsort(np.append(ends, jumps), kind="stable")
+            order = np.append(order[order != count], count)
+            ends = np.append(ends, jumps)[order]
+            places = np.append(places, np.full((len(jumps), 3), -1), axis=0)[order]
+        places[:, 2] = scheme.stages
+        times = np.empty((len(ends), 2))
+        times[0, 0], times[1:, 0], times[:, 1] = start, ends[:-1], ends
         given = self.given_numbers(interval, times, values)
-        roots = self._roots(interval, times, places, given, step, mean, scale)
+        roots = self._roots(interval, Flows(times, places, given), step, mean, scale)
         coin = int(system.kind == ORDERED)
         width = roots.shape[2]
-        rows = np.column_stack([np.arange(count) * (width + coin), np.full(count, width), np.full(count, coin)]).astype(np.int64)
+        rows = np.empty((count, 3), np.int64)
+        rows[:, 0], rows[:, 1], rows[:, 2] = np.arange(count) * (width + coin), width, coin
         return Events(times, places, given, roots, rows)
 
     def _inputs(self, interval: Interval, t: float, before: bool) -> Array | None:
@@ -228,96 +220,85 @@ class Motion:
         """Return the given numbers of the drift (E, 2, L) at both ends of each flow."""
         system, length = self.system, interval.stop - interval.start
         given = np.zeros((len(times), 2, system.drift.width))
-        known: Array | None = None
         if not given.shape[2]:
+            return given
+        if not system.timed:
+            given[:] = self._given(interval, interval.start, False, values, length)
             return given
         for e, pair in enumerate(times):
             for side, t in enumerate(pair):
-                if known is not None and not system.timed:
-                    given[e, side] = known
-                    continue
-                u = self._inputs(interval, t, bool(side))
-                parts = [np.zeros(0) if u is None else u]
-                P = np.zeros((system.m, system.m))
-                if not system.sampled:
-                    P = system.precision(t, interval.inside, self.theta, u)
-                    parts += [P @ np.where(interval.inside, values, 0.0) / length, [P[pair] for pair in system.numbers.pairs]]
-                if system.root_pairs:
-                    Q = system.own_noise(t, P, self.theta, u)
-                    parts.append([Q[pair] for pair in system.root_pairs])
-                given[e, side] = known = np.concatenate(parts)
+                given[e, side] = self._given(interval, t, bool(side), values, length)
         return given
 
-    def _roots(
-        self, interval: Interval, times: Array, places: Array, given: Array, step: float, mean: Array, scale: Array
-    ) -> Array:
+    def _given(self, interval: Interval, t: float, before: bool, values: Array, length: float) -> Array:
+        """Return the given numbers (L,) of the drift at one time."""
+        system, u = self.system, self._inputs(interval, t, before)
+        parts = [np.zeros(0) if u is None else u]
+        P = np.zeros((system.m, system.m))
+        if not system.sampled:
+            P = self.precision(t, interval.inside, u)
+            parts += [P @ np.where(interval.inside, values, 0.0) / length, [P[pair] for pair in system.numbers.pairs]]
+        if system.root_pairs:
+            Q = system.own_noise(t, P, self.theta, u)
+            parts.append([Q[pair] for pair in system.root_pairs])
+        return np.concatenate(parts)
+
+    @cached_property
+    def _precisions(self) -> dict[bytes, Array]:
+        return {}
+
+    def precision(self, t: float, seen: Array, u: Array | None) -> Array:
+        """Return the inverse (m, m) of the noise of the observed coordinates per unit time, zero elsewhere."""
+        system = self.system
+        if system.timed:
+            return system.precision(t, seen, self.theta, u)
+        key = seen.tobytes()
+        if key not in self._precisions:
+            self._precisions[key] = system.precision(t, seen, self.theta, u)
+        return self._precisions[key]
+
+    def _roots(self, interval: Interval, flows: Flows, step: float, mean: Array, scale: Array) -> Array:
         """Return the roots of the noise of all substeps, (J, n, d), or (J, r, d) for the coefficients of fields."""
-        system, kicks = self.system, np.flatnonzero(places[:, 0] >= 0)
-        if system.kind == ADDITIVE and system.affine and not system.timed and system.cross is None:
-            # Nothing but the length decides, and equal lengths are frequent.
-            return np.repeat(self._root_of(step)[None], len(kicks), axis=0)
-        covs = list[Array]()
-        for e in kicks if system.timed else kicks[:1]:
-            u = self._inputs(interval, times[e, 1], True)
-            P = np.zeros((system.m, system.m))
-            if system.cross is not None:
-                P = system.precision(times[e, 1], interval.inside, self.theta, u)
-            known = self.covariance if system.kind == ADDITIVE else self._own_noise
-            covs.append(known(times[e, 1], P, u))
-        G = np.array(covs)
+        system, (times, places, given) = self.system, flows
+        kicks = np.flatnonzero(places[:, 0] >= 0)
         if system.kind != ADDITIVE:
-            found = roots(G) * np.sqrt(step)
-            return np.ascontiguousarray(found if system.timed else np.repeat(found, len(kicks), axis=0))
-        A = self._slopes(times, places, given, mean, scale)
-        if not system.affine:
-            size = np.abs(A).sum(axis=2).max(axis=1) * step
-            A = A * (_CARRIED / np.maximum(size, _CARRIED))[:, None, None]
-        return np.ascontiguousarray(roots(noise_about_middle(A, np.broadcast_to(G, A.shape), step)))
+            if not system.timed and system.cross is None:
+                return np.repeat(self._constant_root * np.sqrt(step), len(kicks), axis=0)
+            found = roots(self._at_kicks(interval, times[kicks, 1], self._own_noise)) * np.sqrt(step)
+            return found if system.timed else np.repeat(found, len(kicks), axis=0)
+        if system.timed or system.cross is not None:
+            G = self._at_kicks(interval, times[kicks, 1], self.covariance)
+        else:
+            G = self._constant_covariance[None]
+        A = self.constant_matrix if system.affine else np.zeros((0, 0))
+        out = np.empty((len(kicks), system.n, system.n))
+        none = np.zeros((0, system.n, 0)), np.zeros((len(kicks), 3), np.int64)
+        width = noise_kernels.kick_roots(self.arrays, (times, places, given, *none), A, step, mean, scale, G, out)
+        return np.ascontiguousarray(out[:, :, :width])
+
+    @cached_property
+    def _constant_root(self) -> Array:
+        nothing = np.zeros((self.system.m, self.system.m))
+        return roots(self.system.own_noise(float(self.system.model.start), nothing, self.theta, None)[None])
+
+    def _at_kicks(self, interval: Interval, times: Array, noise: Callable[[float, Array, Array | None], Array]) -> Array:
+        """Return the covariance of the noise at all kicks, or (1, ...) where it does not depend on time."""
+        system, found = self.system, list[Array]()
+        for t in times if system.timed else times[:1]:
+            u = self._inputs(interval, t, True)
+            P = np.zeros((system.m, system.m)) if system.cross is None else self.precision(t, interval.inside, u)
+            found.append(noise(t, P, u))
+        return np.array(found)
 
     def _own_noise(self, t: float, P: Array, u: Array | None) -> Array:
         return self.system.own_noise(t, P, self.theta, u)
 
-    def _slopes(self, times: Array, places: Array, given: Array, mean: Array, scale: Array) -> Array:
-        """Return df/dx (J, n, n) at the kicks along the path of a state without noise."""
-        system = self.system
-        kicks = np.flatnonzero(places[:, 0] >= 0)
-        if system.affine:
-            return np.repeat(self.constant_matrix[None], len(kicks), axis=0)
-        marked = np.column_stack([np.full(len(places), -1), places[:, 0], places[:, 2]]).astype(np.int64)
-        none = Events(times, marked, given, np.zeros((0, system.n, 0)), np.zeros((0, 3), np.int64))
-        ends = np.zeros((len(kicks), system.n, 1))
-        self.advanced(none, np.ascontiguousarray(mean[:, None]), np.zeros((0, 1)), ends)
-        if not (system.timed or system.driven):
-            return self.matrices(ends[:, :, 0], scale, times[0, 1], given[0, 1])
-        found = [self.matrices(ends[j, None, :, 0], scale, times[e, 1], given[e, 1]) for j, e in enumerate(kicks)]
-        return np.concatenate(found)
-
 
 def noise_about_middle(A: Array, G: Array, length: float) -> Array:
-    """Return int exp(-s A) G exp(-s A') ds over (-length/2, length/2): the noise of a substep, carried to its middle.
-
-    A and G are matrices (J, n, n).
-    """
-    size = float(np.abs(A).sum(axis=2).max(initial=0.0)) * length
-    if size <= _SERIES:
-        term, total, factor = G, length * G, length
-        for k in range(1, 40):
-            change = A @ term
-            term = -(change + change.transpose(0, 2, 1))
-            factor = factor * 0.5 * length / (k + 1)
-            if k % 2 == 0:
-                change = factor * term
-                total = total + change
-                if np.abs(change).max() <= 1e-15 * np.abs(total).max():
-                    break
-        return np.asarray(0.5 * (total + total.transpose(0, 2, 1)))
-    n = A.shape[1]
-    block = np.block([[-A, G], [np.zeros_like(A), A.transpose(0, 2, 1)]])
-    E = expm(block * length)
-    F = E[:, n:, n:].transpose(0, 2, 1)
-    back = expm(-0.5 * length * A)
-    Q = back @ (F @ E[:, :n, n:]) @ back.transpose(0, 2, 1)
-    return np.asarray(0.5 * (Q + Q.transpose(0, 2, 1)))
+    """Return int exp(-s A) G exp(-s A') ds (n, n) over (-length/2, length/2): the noise of a substep, carried to its middle."""
+    found = np.empty_like(G)
+    noise_kernels.noise_about_middle(A, np.ascontiguousarray(G), length, found)
+    return found
 
 
 class Steps(NamedTuple):
@@ -399,69 +380,30 @@ def _time_errors(
     normals(key_of(pilots.key), 0, noise.shape[1], noise)
     shared = _coarse_noise(motion, coarse, fine, noise)
     y, finer = motion.advanced(fine, pilots.states, noise)
-    centred = y - y.mean(axis=1, keepdims=True)
-    spread = np.maximum(centred.std(axis=1), 1e-9 * scale)
-    # What contracts in the interval is judged by the deviation at its end.
-    began = pilots.states.std(axis=1)
-    contracted = np.divide(spread, began, out=np.ones(len(began)), where=began > 0)
-    judged = scale * np.clip(contracted, LEAST_CONTRACTION, 1.0)
 
     def change(stages: int) -> tuple[float, Array, float]:
         places = coarse.places.copy()
         places[:, 2] = stages
         x, gained = motion.advanced(coarse._replace(places=places), pilots.states, shared)
-        d, weight = x - y, gained - finer
-        if system.angles.any():
-            d[system.angles] = np.remainder(d[system.angles] + np.pi, 2 * np.pi) - np.pi
-        weighted = (weight - weight.mean()) * centred
-        parts = (d, d * centred / spread[:, None], weighted)
-        squares, noise = (np.array([f(part) for part in parts]) for f in (_squared_mean, _variance_of_mean))
-        # What the number of pilots adds to a mean of zero is not subtracted: few cannot show that there is no error.
-        largest = np.sqrt(squares.max(axis=0)) / judged
-        surely = np.sqrt((squares + noise).max(axis=0)) / judged
-        return 4 / 3 * float(largest.max()), 4 / 3 * (d + weighted).mean(axis=1), 4 / 3 * float(surely.max())
+        shift, largest = np.empty(system.n), np.empty(2)
+        step_errors(StepErrors(pilots.states, x, gained, y, finer, system.angles, scale), LEAST_CONTRACTION, shift, largest)
+        return 4 / 3 * float(largest[0]), 4 / 3 * shift, 4 / 3 * float(largest[1])
 
     return change(2), change(4)
 
 
-def carried_shift(motion: Motion, events: Events, x: Array, shift: Array) -> Array:
-    """Return what a shift (n,) of particles x (n, N) becomes in the mean after an interval, without noise.
-
-    Between two modes the path of the mean itself would be unstable where no particle is.
-    """
-    count, angles = x.shape[1], motion.system.angles
-    both = np.concatenate([x, x + shift[:, None]], axis=1)
-    ends, _ = motion.advanced(events, both, np.zeros((events.width, 2 * count)))
-    apart = ends[:, count:] - ends[:, :count]
-    apart[angles] = np.remainder(apart[angles] + np.pi, 2 * np.pi) - np.pi
-    found = apart.mean(axis=1)
-    return np.where(np.isfinite(found), found, shift)
-
-
-def _squared_mean(part: Array) -> Array:
-    return np.asarray(part.mean(axis=1) ** 2)
-
-
-def _variance_of_mean(part: Array) -> Array:
-    return np.asarray(part.var(axis=1) / part.shape[1])
-
-
 def _coarse_noise(motion: Motion, coarse: Events, fine: Events, noise: Array) -> Array:
     """Return the noise of the substeps that makes the same kicks as that of their halves."""
-    system = motion.system
-    shared = np.zeros((coarse.width, noise.shape[1]))
-    back = np.linalg.pinv(coarse.roots, rcond=1e-6) if system.kind == ADDITIVE else coarse.roots
-    for j in range(len(coarse.rows)):
+    count, pilots = len(coarse.rows), noise.shape[1]
+    if motion.system.kind == ADDITIVE:
+        kicks = fine.roots @ noise.reshape(2 * count, -1, pilots) if fine.width else np.zeros((2 * count, motion.system.n, pilots))
+        shared = np.linalg.pinv(coarse.roots, rcond=1e-6) @ (kicks[::2] + kicks[1::2])
+        return np.ascontiguousarray(shared.reshape(coarse.width, pilots))
+    shared = np.zeros((coarse.width, pilots))
+    for j in range(count):
         first, width, coin = coarse.rows[j]
-        halves = []
-        for i in (2 * j, 2 * j + 1):
-            begin, own, _ = fine.rows[i]
-            halves.append(noise[begin : begin + own])
-        if system.kind == ADDITIVE:
-            moved = sum(fine.roots[2 * j + i] @ halves[i] for i in range(2))
-            shared[first : first + width] = back[j] @ moved
-        else:
-            shared[first : first + width] = (halves[0] + halves[1]) / np.sqrt(2)
-            if coin:
-                shared[first + width] = noise[fine.rows[2 * j, 0] + fine.rows[2 * j, 1]]
+        halves = [noise[begin : begin + own] for begin, own, _ in fine.rows[2 * j : 2 * j + 2]]
+        shared[first : first + width] = (halves[0] + halves[1]) / np.sqrt(2)
+        if coin:
+            shared[first + width] = noise[fine.rows[2 * j, 0] + fine.rows[2 * j, 1]]
     return shared

@@ -6,34 +6,50 @@ from typing import NamedTuple
 
 import numpy as np
 
-from zakai.densities._values import wrap
 from zakai.methods.particles.programs import Array
 from zakai.methods.particles.system import System
+from zakai.numerics.particles import population
 
 
 def moments(particles: Array, weights: Array, angles: Array) -> tuple[Array, Array, Array]:
     """Return the mean (n,), the deviations from it (n, N), and the covariance (n, n); angles have their mean direction."""
-    mean = particles @ weights
+    n = len(particles)
+    mean, deviations, cov = np.empty(n), np.empty(particles.shape), np.empty((n, n))
     if angles.any():
         x, y = (function(particles[angles]) @ weights for function in (np.cos, np.sin))
         mean[angles] = np.where(np.hypot(x, y) < 1e-9, 0.0, np.arctan2(y, x))
-    deviations = particles - mean[:, None]
-    if angles.any():
-        deviations[angles] = wrap(deviations[angles])
-    return mean, deviations, (deviations * weights) @ deviations.T
+    population.moments(np.ascontiguousarray(particles), weights, angles, mean, deviations, cov)
+    return mean, deviations, cov
 
 
 class Moments(NamedTuple):
-    """The mean (n',) of the coordinates, deviations (n, N) and covariance (n, n) of the states, the spread (n',) of particles."""
+    """The mean (n',) of the coordinates, the covariance (n, n) of the states, the spread (n',) of particles, and these."""
 
     mean: Array
-    deviations: Array
     cov: Array
     spread: Array
+    particles: Weighted
+
+    @property
+    def deviations(self) -> Array:
+        """The standard deviations (n,) of the states."""
+        return np.sqrt(np.maximum(np.diag(self.cov), 0.0))
+
+
+class Weighted(NamedTuple):
+    """Deviations (n, N) of particles from their mean, their weights (N,), and the covariance (n, n) of the particles.
+
+    That is without what each carries by a filter of its own.
+    """
+
+    deviations: Array
+    weights: Array
+    cov: Array
 
 
 def moments_of(system: System, particles: Array, weights: Array) -> Moments:
     """Return the moments of weighted particles of a system."""
     mean, deviations, cov = moments(particles, weights, system.angles)
     n, spread = system.model.n, np.sqrt(np.maximum(np.diag(cov), 0.0))
-    return Moments(mean, deviations[:n], system.widened(mean, cov[:n, :n]), spread)
+    own = np.ascontiguousarray(cov[:n, :n])
+    return Moments(mean, system.widened(mean, own), spread, Weighted(deviations[:n], weights, own))

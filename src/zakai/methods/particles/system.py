@@ -24,6 +24,7 @@ from zakai.models.model import Model
 from zakai.models.numeric import numpy_function
 from zakai.models.prior import DensityPrior, GaussianPrior, MixturePrior
 from zakai.numerics.particles.motion import ADDITIVE, COMMUTING, ORDERED
+from zakai.numerics.particles.noise import write_roots
 
 _MOST_ENTRIES = 400  # of the Jacobian of a drift that is checked for being affine
 
@@ -219,12 +220,8 @@ def root(Q: Array) -> Array:
 def roots(Q: Array) -> Array:
     """Return columns R (J, n, d) with R R' = Q for matrices (J, n, n); the last ones are zero where Q has null directions.
 
-    The matrices are scaled to a unit diagonal first, so that a coordinate with little noise keeps it.
+    A coordinate with little noise keeps it.
     """
-    spread = np.sqrt(np.maximum(np.diagonal(Q, axis1=1, axis2=2), 0.0))
-    scale = np.where(spread > 0, spread, 1.0)
-    values, vectors = np.linalg.eigh(Q / (scale[:, :, None] * scale[:, None, :]))
-    used = values > 1e-11
-    width = int(used.sum(axis=1).max(initial=0))
-    found = scale[:, :, None] * vectors * np.sqrt(np.where(used, values, 0.0))[:, None, :]
-    return np.asarray(found[:, :, ::-1][:, :, :width])
+    found = np.empty(Q.shape)
+    width = write_roots(np.ascontiguousarray(Q), found)
+    return np.ascontiguousarray(found[:, :, :width])

@@ -14,8 +14,8 @@ from zakai.numerics.particles.motion import UPDATE
 def valid(prepared: Prepared, state: State) -> bool:
     """Return whether a state has the shapes and the indices that a step of this filter makes."""
     n, count = prepared.system.n, len(state.log_weights)
-    shapes = state.particles.shape == (n, count) and state.shift.shape == state.last_shift.shape == (n,)
-    shapes = shapes and state.last_scale.shape == (n,)
+    shapes = state.particles.shape == (n, count) and state.shift.shape == (prepared.model.n,)
+    shapes = shapes and state.last_shift.shape == state.last_scale.shape == (n,)
     control = state.control
     shapes = shapes and control.stages in (2, 4) and control.interval >= 0 and control.trusted >= 0
     return count > 0 and shapes and _window(prepared, state.window, count) and _genealogy(state, count, prepared.model.n)

@@ -232,6 +232,14 @@ class Target:
         prior = self.prior or (np.zeros(n), np.zeros((n, 0)))
         return moves.WindowLaw(self.motion.arrays, tuple(self.events), observed, prior)
 
+    def propagate(self, key: Array, update: bool) -> tuple[moves.Advance, int]:
+        """Return the particles after noise that is drawn, and how many are lost; with `update` those before the last one, too."""
+        n, count = self.start.shape
+        noise, states, seen = (np.empty((rows, count)) for rows in (self.events.width, n, n if update else 0))
+        after, arrays = moves.Advance(noise, states, seen, np.empty(count)), self.arrays
+        lost = over_chunks(lambda low, high: moves.propagate(arrays, key, self.start, low, high, after), count)
+        return after, sum(lost)
+
     def follow(self, path: Array) -> tuple[Array, Array]:
         """Return the states (n, N) at the end and the log-likelihoods (N,) for noise (D, N)."""
         out, total = np.empty_like(self.start), np.empty(path.shape[1])

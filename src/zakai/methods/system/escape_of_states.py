@@ -46,11 +46,14 @@ def check_escape(prepared: Any, k: int, moments: Callable[[], tuple[Array, Array
         moments: returns the mean (n,) and the covariance (n, n) of the density at its start.
         infinity: whether paths to infinity are sought, and not only poles.
     """
+    divisors = divisors_of(prepared.model)
+    if divisors is None and not infinity:
+        return
     model, schedule, theta = prepared.model, prepared.schedule, prepared.theta.real
     start, length = float(schedule.starts[k]), float(schedule.lengths[k])
     if length <= 0:
         return
-    hold, inputs, motion, divisors = model.input_hold, schedule.inputs, _motion(model), divisors_of(model)
+    hold, inputs, motion = model.input_hold, schedule.inputs, _motion(model)
 
     def at(points: Array, t: Any, function: NumericFunction = motion) -> Array:
         u = None if inputs is None else inputs.at(np.minimum(t, np.nextafter(start + length, start)), hold)

@@ -6,6 +6,9 @@ import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
+from typing import TypeVar
+
+T = TypeVar("T")
 
 CHUNK = 1024  # particles that are moved together: their noise stays in the cache
 _ALONE = 8192  # particles up to which threads cost more than they save
@@ -21,12 +24,11 @@ def _pool() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(_cores(), thread_name_prefix="zakai-particles")
 
 
-def over_chunks(work: Callable[[int, int], None], count: int) -> None:
-    """Call `work(low, high)` for parts of `count` particles that are multiples of `CHUNK`, on all cores where there are many."""
+def over_chunks(work: Callable[[int, int], T], count: int) -> list[T]:
+    """Return what `work(low, high)` returns for parts of `count` particles that are multiples of `CHUNK`, on all cores where there are many."""
     cores = _cores()
     if count <= _ALONE or cores == 1:
-        work(0, count)
-        return
+        return [work(0, count)]
     size = -(-count // (cores * CHUNK)) * CHUNK
-    for done in [_pool().submit(work, low, min(low + size, count)) for low in range(0, count, size)]:
-        done.result()
+    parts = [_pool().submit(work, low, min(low + size, count)) for low in range(0, count, size)]
+    return [part.result() for part in parts]

@@ -35,6 +35,7 @@ _OBSERVED = types.Tuple((PROGRAM, F1, F2, F2))
 _PRIOR = types.Tuple((F1, F2))
 # The mean (D,), its derivative by the start (D, n), the start to which that refers (n,), the rows of V' (r, D), and s (r,).
 GAUSSIAN = types.Tuple((F1, F2, F1, F2, F1))
+_FAR = 1e100  # a state that has left every bounded set
 _ACCEPTANCE = np.uint64(1 << 60)  # counters from here on are those of acceptance
 _WORST, _BEST = 0.2, 0.4  # acceptance below which steps become shorter, and above which they become longer
 _LONGEST = 0.96  # of the share of the old noise
@@ -63,6 +64,19 @@ class Paths(NamedTuple):
     moved: Array
 
 
+class Advance(NamedTuple):
+    """What `propagate` writes: noise (d, N), states (n, N) after an interval and at the observation, before it updates them.
+
+    The latter may have no rows.  `gained` (N,) is the log-likelihood, -inf where a state has left every bounded set: it is the
+    one at the start then.
+    """
+
+    noise: Array
+    states: Array
+    seen: Array
+    gained: Array
+
+
 class Workspace(NamedTuple):
     """The slots of the programs, and what an event overwrites."""
 
@@ -71,12 +85,18 @@ class Workspace(NamedTuple):
 
 
 WINDOW_LAW = types.NamedTuple((MOTION, EVENTS, _OBSERVED, _PRIOR), WindowLaw)
+ADVANCE = types.NamedTuple((F2, F2, F2, F1), Advance)
 PATHS = types.NamedTuple((F2, F2, F2, F1, F2), Paths)
 
 
 @helper
-def _follow(window: Any, workspace: Any, start: Array, path: Array, x: Array, total: Array, size: int) -> None:
-    """Write the states x (rows, size) at the end of a window and the log-likelihoods (size,) of what is observed in it."""
+def _follow(
+    window: Any, workspace: Any, start: Array, path: Array, x: Array, total: Array, seen: Array, size: int
+) -> None:
+    """Write the states x (rows, size) at the end of a window and the log-likelihoods (size,) of what is observed in it.
+
+    `seen` (n, size) receives the states at the last observation, before they are updated by it; it may have no rows.
+    """
     motion, events, observed, prior = window
     blocks, buffers = workspace
     law, times, given, counted = observed
@@ -97,7 +117,12 @@ def _follow(window: Any, workspace: Any, start: Array, path: Array, x: Array, to
     for e in range(places.shape[0]):
         run_event(motion, events, e, blocks, x, own, buffers, size)
         k = places[e, 1]
-        if k < 0 or counted[k].sum() == 0.0:
+        if k < 0:
+            continue
+        for d in range(seen.shape[0]):
+            for i in range(size):
+                seen[d, i] = x[d, i]
+        if counted[k].sum() == 0.0:
             continue
         load_point(law, blocks[3], x, motion[2], times[k], given[k], size)
         run_program(law, blocks[3], size)
@@ -177,12 +202,57 @@ def follow(window: Any, start: Array, path: Array, low: int, high: int, out: Arr
         for r in range(D):
             for i in range(size):
                 own[r, i] = path[r, first + i]
-        _follow(window, workspace, begin, own, x, found, size)
+        _follow(window, workspace, begin, own, x, found, own[:0], size)
         for d in range(n):
             for i in range(size):
                 out[d, first + i] = x[d, i]
         for i in range(size):
             total[first + i] = found[i]
+
+
+@kernel(types.int64(WINDOW_LAW, KEY, F2, types.int64, types.int64, ADVANCE))
+def propagate(window: Any, key: Array, start: Array, low: int, high: int, after: Any) -> int:
+    """Advance the particles (n, N) from `low` to `high` by an interval with noise that is drawn; return how many are lost."""
+    noise, states, seen, gained = after
+    n, D, lost = start.shape[0], noise.shape[0], 0
+    workspace = _workspace(window)
+    x, found = np.empty((window.motion[0][3].size, BLOCK)), np.empty(BLOCK)
+    own, begin, at = np.empty((D + 1, BLOCK)), np.empty((n, BLOCK)), np.empty((seen.shape[0], BLOCK))
+    for first in range(low, high, BLOCK):
+        size = min(BLOCK, high - first)
+        fill_normals(key, first, size, own[:D])
+        for d in range(n):
+            for i in range(size):
+                begin[d, i] = start[d, first + i]
+        _follow(window, workspace, begin, own, x, found, at, size)
+        for r in range(D):
+            for i in range(size):
+                noise[r, first + i] = own[r, i]
+        far = 0.0
+        for d in range(n):
+            for i in range(size):
+                far += 0.0 if abs(x[d, i]) < _FAR else 1.0  # NaN, too
+        for d in range(n):
+            for i in range(size):
+                states[d, first + i] = x[d, i]
+        for d in range(seen.shape[0]):
+            for i in range(size):
+                seen[d, first + i] = at[d, i]
+        for i in range(size):
+            gained[first + i] = found[i]
+        for i in range(size if far > 0.0 else 0):
+            gone = False
+            for d in range(n):
+                gone |= not abs(x[d, i]) < _FAR
+            if not gone:
+                continue
+            lost += 1
+            gained[first + i] = -np.inf
+            for d in range(n):
+                states[d, first + i] = begin[d, i]
+            for d in range(seen.shape[0]):
+                seen[d, first + i] = begin[d, i]
+    return lost
 
 
 @kernel(types.void(GAUSSIAN, types.float64, KEY, F2, types.int64, types.int64, F2, F1))
@@ -274,7 +344,7 @@ def sweep(window: Any, gaussian: Any, control: Array, key: Array, low: int, high
                 for r in range(D if turn >= 0 else 0):
                     for i in range(size):
                         new[r, i] += m[r, i]
-                _follow(window, workspace, begin, new, x, found, size)
+                _follow(window, workspace, begin, new, x, found, new[:0], size)
                 _norms(fresh, D, log_det, gs, size)
                 _norms(new, D, 0.0, phis, size)
                 for i in range(size):

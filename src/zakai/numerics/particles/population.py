@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any, NamedTuple
 
 import numpy as np
 from numba import types
 
-from zakai.numerics.compiled import kernel
+from zakai.numerics.compiled import helper, kernel
+from zakai.numerics.formula_kernel import BLOCK
+from zakai.numerics.particles.elementary import exp_row
 from zakai.numerics.particles.formulas import F1, F2, F3
+from zakai.numerics.particles.noise import root_of
+from zakai.numerics.small_matrices import congruence
 
 Array = Any
+DEPTH = 16  # resamplings that are looked back
 _NEGLIGIBLE = 40.0  # of the logarithm of a weight, below the largest
 I4, I8 = types.int32[::1], types.int64[::1]
 
@@ -29,63 +35,165 @@ def systematic(weights: Array, offset: float, out: Array) -> None:
         j += 1
 
 
-@kernel(types.void(I4, I8, F1, F2, F1, F2, F1, F1))
-def lineage(parents: Array, sizes: Array, weights: Array, deviations: Array, rounding: Array, means: Array, evidence: Array,
-            families: Array) -> None:  # fmt: skip
-    """Write the variances of means (lags, n) and of the log evidence (lags,), and the number of families, by generation.
+@kernel(types.void(F2, F1, types.boolean[::1], F1, F2, F2), reordered=True)
+def moments(x: Array, weights: Array, angles: Array, mean: Array, deviations: Array, cov: Array) -> None:
+    """Write the mean (n,), the deviations from it (n, N) and the covariance (n, n) of weighted particles (n, N).
+
+    Those of angles are in [-pi, pi), and `mean` holds their mean directions.  No row of elementary functions is computed here:
+    these need the order of their sums.
+    """
+    n, count = x.shape
+    other = np.empty((n, BLOCK))
+    for d in range(n):
+        if angles[d]:
+            continue
+        total = 0.0
+        for i in range(count):
+            total += weights[i] * x[d, i]
+        mean[d] = total
+    cov[:] = 0.0
+    for first in range(0, count, BLOCK):
+        size = min(BLOCK, count - first)
+        for d in range(n):
+            for i in range(size):
+                deviations[d, first + i] = x[d, first + i] - mean[d]
+            if angles[d]:
+                for i in range(size):
+                    apart = deviations[d, first + i]
+                    deviations[d, first + i] = apart - 2.0 * math.pi * np.floor(apart / (2.0 * math.pi) + 0.5)
+            for i in range(size):
+                other[d, i] = weights[first + i] * deviations[d, first + i]
+        for d in range(n):
+            for e in range(d + 1):
+                total = 0.0
+                for i in range(size):
+                    total += other[d, i] * deviations[e, first + i]
+                cov[d, e] += total
+    for d in range(n):
+        for e in range(d):
+            cov[e, d] = cov[d, e]
+
+
+@helper
+def _told(mass: Array, sums: Array, count: int, size: int, means: Array, between: Array) -> float:
+    """Write what the masses and the weighted sums (count, n) of families tell; return the sum of the squares of the masses."""
+    square, factor = 0.0, size / max(size - 1, 1)
+    for d in range(means.size):
+        means[d] = between[d] = 0.0
+    for place in range(count):
+        square += mass[place] * mass[place]
+        for d in range(means.size):
+            part = sums[place, d] * sums[place, d]
+            means[d] += factor * part
+            between[d] += part / mass[place]
+    return square
+
+
+@helper
+def _joined(index: Array, labels: Array, count: int, mass: Array, sums: Array) -> int:
+    """Join neighbours whose labels have equal entries in a list, replace the labels, and return how many families are left."""
+    kept = -1
+    for place in range(count):
+        label = index[labels[place]]
+        if kept >= 0 and labels[kept] == label:
+            mass[kept] += mass[place]
+            for d in range(sums.shape[1]):
+                sums[kept, d] += sums[place, d]
+            continue
+        kept += 1
+        labels[kept], mass[kept] = label, mass[place]
+        for d in range(sums.shape[1]):
+            sums[kept, d] = sums[place, d]
+    return kept + 1
+
+
+@kernel(types.void(types.UniTuple(I4, DEPTH), I8, I4, F1, F2, F2, F2, F1, F1))
+def lineage(parents: Any, sizes: Array, founders: Array, weights: Array, deviations: Array, means: Array, between: Array,
+            squares: Array, families: Array) -> None:  # fmt: skip
+    """Write what families of particles tell, by generation, and last for those of the first ancestors.
+
+    Systematic resampling keeps the order of the particles, so that the members of a family are neighbours.
 
     Args:
-        parents: the ancestors of one generation after the other, newest first.
-        sizes: the particles now, then those of each earlier generation (lags,).
+        parents: the ancestors of the last resamplings, newest last.
+        sizes: the particles now, those of each earlier generation, and the first ancestors (lags + 1,).
+        founders: the first ancestors (N,).
         weights: of the particles (N,).
         deviations: of the particles from their mean (n, N).
-        rounding: what resampling adds to the spread of the masses until each generation (lags,).
-        means: receives the variances of the means.
-        evidence: receives those of the log evidence.
-        families: receives the numbers of families.
+        means: receives the variances of the means (lags + 1, n).
+        between: receives the variances of the states between families (lags + 1, n).
+        squares: receives the sums of the squares of the masses of families (lags + 1,).
+        families: receives the numbers of families (lags + 1,).
     """
-    n, most, first = deviations.shape[0], sizes.max(), 0
-    mass, sums = weights.copy(), np.empty((most, n))
-    older_mass, older_sums = np.empty(most), np.empty((most, n))
-    alive, count = np.empty(weights.size, np.int32), 0
+    n, count, last = deviations.shape[0], 0, sizes.size - 1
+    labels, mass, sums = np.empty(weights.size, np.int32), np.empty(weights.size), np.empty((weights.size, n))
     for i in range(weights.size):
         if weights[i] > 0.0:
-            alive[count] = i
-            count += 1
-        for d in range(n):
-            sums[i, d] = weights[i] * deviations[d, i]
-    for lag in range(sizes.size):
-        if lag:
-            kept = 0
-            for place in range(count):
-                older_mass[parents[first + alive[place]]] = 0.0
-            for place in range(count):
-                f = alive[place]
-                parent = parents[first + f]
-                if older_mass[parent] == 0.0:
-                    alive[kept] = parent
-                    kept += 1
-                    for d in range(n):
-                        older_sums[parent, d] = 0.0
-                older_mass[parent] += mass[f]
-                for d in range(n):
-                    older_sums[parent, d] += sums[f, d]
-            first += sizes[lag - 1]
-            count = kept
-            mass, older_mass = older_mass, mass
-            sums, older_sums = older_sums, sums
-            if older_mass.size < most:
-                older_mass = np.empty(most)
-        square, factor = 0.0, sizes[lag] / max(sizes[lag] - 1, 1)
-        for d in range(n):
-            means[lag, d] = 0.0
-        for place in range(count):
-            f = alive[place]
-            square += mass[f] * mass[f]
+            labels[count], mass[count] = i, weights[i]
             for d in range(n):
-                means[lag, d] += factor * sums[f, d] * sums[f, d]
-        evidence[lag] = square - 1.0 / sizes[lag] - rounding[lag]
+                sums[count, d] = weights[i] * deviations[d, i]
+            count += 1
+    own, own_mass, own_sums = labels[:count].copy(), mass[:count].copy(), sums[:count].copy()
+    own_count = _joined(founders, own, count, own_mass, own_sums)
+    squares[last] = _told(own_mass, own_sums, own_count, sizes[last], means[last], between[last])
+    families[last] = own_count
+    for lag in range(last):
+        if lag:
+            count = _joined(parents[DEPTH - lag], labels, count, mass, sums)
+        squares[lag] = _told(mass, sums, count, sizes[lag], means[lag], between[lag])
         families[lag] = count
+
+
+@kernel(types.void(F3, F2, F2, F2))
+def carry(excess: Array, across: Array, cov: Array, T: Array) -> None:
+    """Write T = across cov^-1 (n, n), in the directions in which particles differ, and replace X (I, n, n) by T X T'.
+
+    cov^-1 is that of the rows and columns of the pivots of Cholesky's factor, and zero elsewhere.
+    """
+    n = cov.shape[0]
+    R, solved = np.empty((n, n)), np.empty(n)
+    pivots = np.empty(n, np.int64)
+    rank = root_of(cov, R, pivots)
+    T[:] = 0.0
+    for row in range(n):
+        for k in range(rank):
+            total = across[row, pivots[k]]
+            for j in range(k):
+                total -= R[pivots[k], j] * solved[j]
+            solved[k] = total / R[pivots[k], k]
+        for k in range(rank - 1, -1, -1):
+            total = solved[k]
+            for j in range(k + 1, rank):
+                total -= R[pivots[j], k] * T[row, pivots[j]]
+            T[row, pivots[k]] = total / R[pivots[k], k]
+    product, found = np.empty((n, n)), np.empty((n, n))
+    for i in range(excess.shape[0]):
+        congruence(found, T, excess[i], product)
+        excess[i] = found
+
+
+@kernel(types.float64(F1, F1, F1))
+def weigh(logs: Array, gained: Array, weights: Array) -> float:
+    """Write weights (N,) that sum to one, and return the logarithm of the sum of exp(logs + gained).
+
+    It is -inf, and the weights are equal, where that is not a number above zero.
+    """
+    count, top = logs.size, -np.inf
+    for i in range(count):
+        weights[i] = logs[i] + gained[i]
+        top = max(top, weights[i])
+    if not np.isfinite(top):
+        weights[:] = 1.0 / count
+        return -np.inf
+    for i in range(count):
+        weights[i] -= top
+    exp_row(weights, weights)
+    total = 0.0
+    for i in range(count):
+        total += weights[i]
+    for i in range(count):
+        weights[i] /= total
+    return top + math.log(total)
 
 
 class Candidates(NamedTuple):

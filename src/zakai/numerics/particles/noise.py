@@ -1,0 +1,232 @@
+"""The noise of substeps that does not depend on the state: its covariance, carried to the middle, and the root of that.
+
+    Q = int exp(-s A) G exp(-s A') ds over (-d/2, d/2),      R R' = Q
+
+A is df/dx where the path of a state without noise is in the middle of the substep, of length d.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numba import types
+
+from zakai.numerics.compiled import helper, kernel
+from zakai.numerics.formula_kernel import BLOCK
+from zakai.numerics.particles.formulas import BOX, F1, F2, F3, PROGRAM, block_of, load_point, run_program
+from zakai.numerics.particles.motion import EVENTS, MOTION, buffers_of, run_event
+from zakai.numerics.small_matrices import multiply
+
+Array = Any
+_SERIES = 4.0  # norm of A times the length up to which Q is a series; twice as long by halves
+_SMALL = 1e-11  # residual of a variance, relative to it, that is no direction of its own
+# Norm of df/dx times a substep above which it is reduced where f is not linear: noise that is carried far to the middle of a
+# substep is amplified there, and a nonlinear flow does not take that back.
+_CARRIED = 2.0
+_STEP = 1e-5  # of forward differences, in standard deviations
+
+
+@helper
+def root_of(Q: Array, out: Array, pivots: Array) -> int:
+    """Write columns R (n, n) with R R' = Q (n, n) by Cholesky's factor with pivots (n,), and return how many are not zero.
+
+    A coordinate with little noise keeps it: variances are compared with what they were.
+    """
+    n = Q.shape[0]
+    left, used = np.empty(n), np.zeros(n, np.bool_)
+    out[:] = 0.0
+    for i in range(n):
+        left[i] = Q[i, i]
+    for rank in range(n):
+        pivot, most = 0, 0.0
+        for i in range(n):
+            share = left[i] / Q[i, i] if Q[i, i] > 0.0 and not used[i] else 0.0
+            if share > most:
+                pivot, most = i, share
+        if not most > _SMALL:
+            return rank
+        used[pivot], pivots[rank] = True, pivot
+        size = np.sqrt(left[pivot])
+        for i in range(n):
+            if used[i] and i != pivot:
+                continue
+            total = Q[i, pivot]
+            for k in range(rank):
+                total -= out[i, k] * out[pivot, k]
+            out[i, rank] = size if i == pivot else total / size
+            left[i] -= out[i, rank] ** 2
+    return n
+
+
+@kernel(types.int64(F3, F3))
+def write_roots(Q: Array, out: Array) -> int:
+    """Write the roots (J, n, n) of covariances (J, n, n), and return how many of their columns are not all zero."""
+    width, pivots = 0, np.empty(Q.shape[1], np.int64)
+    for j in range(Q.shape[0]):
+        width = max(width, root_of(Q[j], out[j], pivots))
+    return width
+
+
+@helper
+def _exponential(A: Array, length: float, out: Array) -> None:
+    """Write exp(length A) for a small norm."""
+    n = A.shape[0]
+    term, product = np.zeros((n, n)), np.empty((n, n))
+    out[:] = 0.0
+    for i in range(n):
+        term[i, i] = out[i, i] = 1.0
+    for k in range(1, 30):
+        multiply(product, A, term)
+        for i in range(n):
+            for j in range(n):
+                term[i, j] = product[i, j] * length / k
+                out[i, j] += term[i, j]
+
+
+@helper
+def noise_about(A: Array, G: Array, length: float, out: Array) -> None:
+    """Write int exp(-s A) G exp(-s A') ds over (-length/2, length/2)."""
+    n = A.shape[0]
+    norm, halves = 0.0, 0
+    for i in range(n):
+        total = 0.0
+        for j in range(n):
+            total += abs(A[i, j])
+        norm = max(norm, total * length)
+    while norm > _SERIES and halves < 60:
+        norm, halves = 0.5 * norm, halves + 1
+    own = length / 2.0**halves
+    term, product, factor = G.copy(), np.empty((n, n)), own
+    for i in range(n):
+        for j in range(n):
+            out[i, j] = own * G[i, j]
+    for k in range(1, 40):
+        multiply(product, A, term)
+        factor = factor * 0.5 * own / (k + 1)
+        largest = change = 0.0
+        for i in range(n):
+            for j in range(n):
+                term[i, j] = -(product[i, j] + product[j, i])
+        if k % 2:
+            continue
+        for i in range(n):
+            for j in range(n):
+                out[i, j] += factor * term[i, j]
+                change, largest = max(change, abs(factor * term[i, j])), max(largest, abs(out[i, j]))
+        if change <= 1e-15 * largest:
+            break
+    if halves:
+        back, ahead, other = np.empty((n, n)), np.empty((n, n)), np.empty((n, n))
+        _exponential(A, -0.5 * own, back)
+        _exponential(A, 0.5 * own, ahead)
+        for _ in range(halves):
+            _congruence(back, out, product, term)
+            _congruence(ahead, out, product, other)
+            for i in range(n):
+                for j in range(n):
+                    out[i, j] = term[i, j] + other[i, j]
+            multiply(product, back, back)
+            back[:] = product
+            multiply(product, ahead, ahead)
+            ahead[:] = product
+    for i in range(n):
+        for j in range(i):
+            out[i, j] = out[j, i] = 0.5 * (out[i, j] + out[j, i])
+
+
+@helper
+def _congruence(M: Array, Q: Array, product: Array, out: Array) -> None:
+    """Write M Q M'; `product` is overwritten."""
+    n = M.shape[0]
+    multiply(product, M, Q)
+    for i in range(n):
+        for j in range(n):
+            total = 0.0
+            for k in range(n):
+                total += product[i, k] * M[j, k]
+            out[i, j] = total
+
+
+@kernel(types.void(F2, F2, types.float64, F2))
+def noise_about_middle(A: Array, G: Array, length: float, out: Array) -> None:
+    """Write the covariance (n, n) of the noise of a substep, carried to its middle."""
+    noise_about(A, G, length, out)
+
+
+@helper
+def _slopes(program: Any, values: Array, box: Any, x: Array, step: Array, time: float, given: Array, out: Array) -> None:
+    """Write df/dx (n, n) at a point (n,) by forward differences with steps (n,); `values` is a block of the program."""
+    n, most = x.size, BLOCK - 1
+    points, f = np.empty((n, BLOCK)), np.empty(n)
+    for first in range(0, n, most):
+        size = min(most, n - first)
+        for i in range(n):
+            for j in range(size + 1):
+                points[i, j] = x[i]
+        for j in range(size):
+            points[first + j, j + 1] += step[first + j]
+        load_point(program, values, points, box, time, given, size + 1)
+        run_program(program, values, size + 1)
+        for i in range(n):
+            f[i] = values[program[3][i], 0]
+        for i in range(n):
+            row = values[program[3][i]]
+            for j in range(size):
+                slope = (row[j + 1] - f[i]) / step[first + j]
+                out[i, first + j] = slope if np.isfinite(slope) else 0.0
+
+
+@kernel(types.void(PROGRAM, BOX, F1, F1, types.float64, F1, F2))
+def slopes(program: Any, box: Any, x: Array, scale: Array, time: float, given: Array, out: Array) -> None:
+    """Write df/dx (n, n) at a point (n,) with the standard deviations (n,) of the state, 0 where it is not finite."""
+    _slopes(program, block_of(program), box, x, _STEP * scale, time, given, out)
+
+
+@kernel(types.int64(MOTION, EVENTS, F2, types.float64, F1, F1, F3, F3))
+def kick_roots(motion: Any, events: Any, A: Array, length: float, mean: Array, scale: Array, G: Array, out: Array) -> int:
+    """Write the roots (J, n, n) of the noise of all kicks, and return how many of their columns are not all zero.
+
+    Args:
+        motion: the formulas.
+        events: the events of an interval, without roots.
+        A: the matrix (n, n) of an affine drift, or (0, 0), where it is computed along the path of a state.
+        length: of a substep.
+        mean: the state (n,) at the start.
+        scale: standard deviations (n,) of the state.
+        G: the covariance of the noise per unit time at each kick (J, n, n), or at all (1, n, n).
+        out: receives the roots.
+    """
+    times, places, given = events[0], events[1], events[2]
+    n, width = mean.size, 0
+    blocks = (block_of(motion[0]), block_of(motion[1]), block_of(motion[4]))
+    buffers = buffers_of(motion, events)
+    x, none, at = np.zeros((motion[0][3].size, BLOCK)), np.empty((1, BLOCK)), np.empty(n)
+    slope, Q, pivots = np.empty((n, n)), np.empty((n, n)), np.empty(n, np.int64)
+    for d in range(n):
+        x[d, 0] = mean[d]
+    for e in range(places.shape[0]):
+        if not A.size:
+            run_event(motion, events, e, blocks, x, none, buffers, 1)
+        j = places[e, 0]
+        if j < 0:
+            continue
+        if A.size:
+            slope[:] = A
+        else:
+            for d in range(n):
+                at[d] = x[d, 0]
+            _slopes(motion[0], blocks[0], motion[2], at, _STEP * scale, times[e, 1], given[e, 1], slope)
+            norm = 0.0
+            for row in range(n):
+                total = 0.0
+                for column in range(n):
+                    total += abs(slope[row, column])
+                norm = max(norm, total * length)
+            if norm > _CARRIED:
+                for row in range(n):
+                    for column in range(n):
+                        slope[row, column] *= _CARRIED / norm
+        noise_about(slope, G[j if G.shape[0] > 1 else 0], length, Q)
+        width = max(width, root_of(Q, out[j], pivots))
+    return width
