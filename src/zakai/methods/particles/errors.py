@@ -41,7 +41,7 @@ class Genealogy(NamedTuple):
     """The parents of the last resamplings, newest last, and the first ancestors.
 
     `parents` and `sizes` are those of the last `DEPTH` resamplings, `rounding` what each adds to the spread of the shares;
-    `founders` (N,) are the first ancestors, of `first` particles.  `age` counts resamplings,
+    `founders` (N,) are the first ancestors, of `first` particles, at the age `born`.  `age` counts resamplings,
     `settled` of which `done` have given their part of the variance of the log-likelihood.  `excess` (DEPTH + 1, n, n) is X of the
     generations of `parents`, and of the particles themselves last.
     """
@@ -51,6 +51,7 @@ class Genealogy(NamedTuple):
     rounding: tuple[float, ...]
     founders: Array
     first: int
+    born: int
     age: int
     settled: float
     done: int
@@ -60,7 +61,7 @@ class Genealogy(NamedTuple):
     def begin(cls, count: int, n: int) -> Genealogy:
         """Return the genealogy of independent particles of n states."""
         founders = np.arange(count, dtype=np.int32)
-        return cls((_NONE,) * DEPTH, (0,) * DEPTH, (0.0,) * DEPTH, founders, count, 0, 0.0, 0, np.zeros((DEPTH + 1, n, n)))
+        return cls((_NONE,) * DEPTH, (0,) * DEPTH, (0.0,) * DEPTH, founders, count, 0, 0, 0.0, 0, np.zeros((DEPTH + 1, n, n)))
 
     def resampled(self, ancestors: Array, weights: Array) -> Genealogy:
         """Return the genealogy after systematic resampling with these weights (N,)."""
@@ -99,19 +100,18 @@ class Genealogy(NamedTuple):
     def renewed(self) -> Genealogy:
         """Return the genealogy of particles whose first ancestors have been drawn again."""
         count = len(self.founders)
-        return self._replace(founders=np.arange(count, dtype=np.int32), first=count)
+        return self._replace(founders=np.arange(count, dtype=np.int32), first=count, born=self.age)
 
 class Variances(NamedTuple):
     """By number of resamplings looked back (lags, ...), and last for the first ancestors.
 
-    The variances of the means (n,), those of the states between families (n,), the sum of the squares of the masses of families,
-    and their number.
+    The variances of the means (n,), those of the states (n,) between families of the oldest generation, and of all generations
+    the sum of the squares of the masses of families and their number (2, lags).
     """
 
     means: Array
     between: Array
-    squares: Array
-    families: Array
+    counts: Array
 
     @property
     def largest(self) -> Array:
@@ -120,9 +120,9 @@ class Variances(NamedTuple):
 
     def forgotten(self, now: Weighted) -> bool:
         """Return whether many first ancestors are left, or the states forget them."""
-        if self.squares[-1] * FEW_FAMILIES <= 1.0:
+        if self.counts[0, -1] * FEW_FAMILIES <= 1.0:
             return True
-        return not (self.between[-2] > REMEMBERED * np.diag(now.cov)).any()
+        return not (self.between > REMEMBERED * np.diag(now.cov)).any()
 
 
 def variances(genealogy: Genealogy, now: Weighted) -> Variances:
@@ -130,17 +130,17 @@ def variances(genealogy: Genealogy, now: Weighted) -> Variances:
     lags = min(genealogy.age, DEPTH)
     sizes = np.array([len(now.weights), *genealogy.sizes[DEPTH - lags :][::-1], genealogy.first])
     count, n = len(sizes), len(now.cov)
-    found = Variances(np.empty((count, n)), np.empty((count, n)), np.empty(count), np.empty(count))
-    lineage(genealogy.parents, sizes, genealogy.founders, now.weights, now.deviations, *found)
+    found, first = Variances(np.empty((count, n)), np.empty(n), np.empty((2, count))), genealogy.age - genealogy.born
+    lineage(genealogy.parents, sizes, first, genealogy.founders, now.weights, now.deviations, *found)
     return found
 
 
 def of_log_likelihood(genealogy: Genealogy, found: Variances) -> tuple[Genealogy, float]:
     """Return the variance of the log-likelihood until now: settled parts of old generations, and what the last ones have."""
-    done, settled, lags = genealogy.done, genealogy.settled, len(found.squares) - 2
+    done, settled, lags = genealogy.done, genealogy.settled, len(found.means) - 2
     sizes = np.array([len(genealogy.founders), *genealogy.sizes[DEPTH - lags :][::-1]])
     rounding = np.cumsum([0.0, *genealogy.rounding[DEPTH - lags :][::-1]])
-    evidence = found.squares[:-1] - 1.0 / sizes - rounding
+    evidence = found.counts[0, :-1] - 1.0 / sizes - rounding
     while genealogy.age - done > LAG and len(evidence) > LAG:
         top = genealogy.age - done
         if top < len(evidence):

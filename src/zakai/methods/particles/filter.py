@@ -42,7 +42,7 @@ from zakai.methods.particles.programs import Array
 from zakai.methods.particles.state import Cloud, Control, Prepared, Rule, State
 from zakai.methods.particles.window import Target, Window, taken
 from zakai.methods.system.escape_of_states import RARE, check_escape
-from zakai.numerics.particles.population import DEPTH, effective, next_power, normalised, systematic, weigh
+from zakai.numerics.particles.population import DEPTH, effective, next_power, normalised, systematic
 from zakai.numerics.particles.random import normals, uniform_number
 
 NOISE, RESAMPLING, PILOT, GUIDE, MOVE, PRIOR, LEVELS = range(7)  # uses of random numbers
@@ -226,11 +226,11 @@ def _step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[Stat
     positive = np.where(spread > 0, spread, np.inf)
     share, random_error = found.largest / positive**2, float(np.sqrt((variance / positive**2).max()))
     until = cloud.genealogy.age + DEPTH if doubtful else control.doubtful_until
-    marked = doubtful or genealogy.age < until or found.families[-2] < FEW_FAMILIES or not found.forgotten(end.particles)
+    marked = doubtful or genealogy.age < until or found.counts[1, -2] < FEW_FAMILIES or not found.forgotten(end.particles)
     health = {
         "effective_sample_size": size,
         "particles": float(len(weights)),
-        "founders": float(found.families[-1]),
+        "founders": float(found.counts[1, -1]),
         "largest_weight": largest,
         "tempering_levels": float(done.levels),
         "acceptance": acceptance,
@@ -322,9 +322,9 @@ def _advanced(prepared: Prepared, cloud: Cloud, events: Events, observed: Observ
     spreads = moved.spread, before.deviations
     if system.sampled and not observed.counted.any() and not lost:
         return Advanced(cloud._replace(particles=particles), weights, 0.0, noise, *spreads)
-    weights = np.empty(count)
-    top = weigh(cloud.logs, logs, weights)
-    after = cloud._replace(particles=particles, logs=cloud.logs + logs - top)
+    total = cloud.logs + logs
+    weights, top = normalised(total)
+    after = cloud._replace(particles=particles, logs=total - top)
     plain = Advanced(after, weights, top, noise, *spreads, lost=lost / count)
     if effective(weights) >= GUIDE_BELOW * count and np.isfinite(top):
         return plain

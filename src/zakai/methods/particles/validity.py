@@ -27,7 +27,7 @@ def _within(index: Array, count: int) -> bool:
 
 def _genealogy(state: State, count: int, n: int) -> bool:
     genealogy = state.genealogy
-    if not (0 <= genealogy.age and 0 <= genealogy.done and genealogy.first > 0):
+    if not (0 <= genealogy.born <= genealogy.age and 0 <= genealogy.done and genealogy.first > 0):
         return False
     if genealogy.excess.shape != (DEPTH + 1, n, n):
         return False

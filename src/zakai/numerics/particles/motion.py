@@ -139,11 +139,6 @@ def _runge_kutta(program: Any, values: Array, x: Array, box: Any, stretch: Any, 
         for i in range(size):
             end = x[d, i] + total[d, i]
             rough[i] += 0.0 if abs(excess[d, i]) <= _ROUGH * (abs(x[d, i]) + abs(end)) else 1.0  # NaN is rough, too
-    marked = 0.0
-    for i in range(size):
-        marked = max(marked, rough[i])
-    if marked == 0.0:
-        return 0
     left = 0
     for i in range(size):
         left += rough[i] > 0.0

@@ -228,10 +228,10 @@ def propagate(window: Any, key: Array, start: Array, low: int, high: int, after:
         for r in range(D):
             for i in range(size):
                 noise[r, first + i] = own[r, i]
-        far = 0.0
+        far = 0
         for d in range(n):
             for i in range(size):
-                far += 0.0 if abs(x[d, i]) < _FAR else 1.0  # NaN, too
+                far += 0 if abs(x[d, i]) < _FAR else 1  # NaN, too
         for d in range(n):
             for i in range(size):
                 states[d, first + i] = x[d, i]
@@ -240,7 +240,7 @@ def propagate(window: Any, key: Array, start: Array, low: int, high: int, after:
                 seen[d, first + i] = at[d, i]
         for i in range(size):
             gained[first + i] = found[i]
-        for i in range(size if far > 0.0 else 0):
+        for i in range(size if far else 0):
             gone = False
             for d in range(n):
                 gone |= not abs(x[d, i]) < _FAR

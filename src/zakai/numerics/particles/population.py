@@ -10,7 +10,6 @@ from numba import types
 
 from zakai.numerics.compiled import helper, kernel
 from zakai.numerics.formula_kernel import BLOCK
-from zakai.numerics.particles.elementary import exp_row
 from zakai.numerics.particles.formulas import F1, F2, F3
 from zakai.numerics.particles.noise import root_of
 from zakai.numerics.small_matrices import congruence
@@ -75,23 +74,9 @@ def moments(x: Array, weights: Array, angles: Array, mean: Array, deviations: Ar
 
 
 @helper
-def _told(mass: Array, sums: Array, count: int, size: int, means: Array, between: Array) -> float:
-    """Write what the masses and the weighted sums (count, n) of families tell; return the sum of the squares of the masses."""
-    square, factor = 0.0, size / max(size - 1, 1)
-    for d in range(means.size):
-        means[d] = between[d] = 0.0
-    for place in range(count):
-        square += mass[place] * mass[place]
-        for d in range(means.size):
-            part = sums[place, d] * sums[place, d]
-            means[d] += factor * part
-            between[d] += part / mass[place]
-    return square
-
-
-@helper
-def _joined(index: Array, labels: Array, count: int, mass: Array, sums: Array) -> int:
+def _joined(index: Array, labels: Array, count: int, families: Any) -> int:
     """Join neighbours whose labels have equal entries in a list, replace the labels, and return how many families are left."""
+    mass, sums, member = families
     kept = -1
     for place in range(count):
         label = index[labels[place]]
@@ -101,15 +86,15 @@ def _joined(index: Array, labels: Array, count: int, mass: Array, sums: Array) -
                 sums[kept, d] += sums[place, d]
             continue
         kept += 1
-        labels[kept], mass[kept] = label, mass[place]
+        labels[kept], mass[kept], member[kept] = label, mass[place], member[place]
         for d in range(sums.shape[1]):
             sums[kept, d] = sums[place, d]
     return kept + 1
 
 
-@kernel(types.void(types.UniTuple(I4, DEPTH), I8, I4, F1, F2, F2, F2, F1, F1))
-def lineage(parents: Any, sizes: Array, founders: Array, weights: Array, deviations: Array, means: Array, between: Array,
-            squares: Array, families: Array) -> None:  # fmt: skip
+@kernel(types.void(types.UniTuple(I4, DEPTH), I8, types.int64, I4, F1, F2, F2, F1, F2))
+def lineage(parents: Any, sizes: Array, first: int, founders: Array, weights: Array, deviations: Array, means: Array,
+            between: Array, counts: Array) -> None:  # fmt: skip
     """Write what families of particles tell, by generation, and last for those of the first ancestors.
 
     Systematic resampling keeps the order of the particles, so that the members of a family are neighbours.
@@ -117,31 +102,46 @@ def lineage(parents: Any, sizes: Array, founders: Array, weights: Array, deviati
     Args:
         parents: the ancestors of the last resamplings, newest last.
         sizes: the particles now, those of each earlier generation, and the first ancestors (lags + 1,).
+        first: the number of the generation of the first ancestors, or more than there are.
         founders: the first ancestors (N,).
         weights: of the particles (N,).
         deviations: of the particles from their mean (n, N).
         means: receives the variances of the means (lags + 1, n).
-        between: receives the variances of the states between families (lags + 1, n).
-        squares: receives the sums of the squares of the masses of families (lags + 1,).
-        families: receives the numbers of families (lags + 1,).
+        between: receives the variances (n,) of the states between the families of the oldest generation.
+        counts: receives the sums of the squares of the masses of families and their numbers (2, lags + 1).
     """
     n, count, last = deviations.shape[0], 0, sizes.size - 1
-    labels, mass, sums = np.empty(weights.size, np.int32), np.empty(weights.size), np.empty((weights.size, n))
+    labels, member = np.empty(weights.size, np.int32), np.empty(weights.size, np.int32)
+    mass, sums = np.empty(weights.size), np.empty((weights.size, n))
     for i in range(weights.size):
-        if weights[i] > 0.0:
-            labels[count], mass[count] = i, weights[i]
+        labels[count] = member[count] = i
+        mass[count] = weights[i]
+        for d in range(n):
+            sums[count, d] = weights[i] * deviations[d, i]
+        count += weights[i] > 0.0
+    for lag in range(last + 1):
+        if lag == last:
+            if first < last:
+                means[lag], counts[:, lag] = means[first], counts[:, first]
+                break
+            for place in range(count):
+                labels[place] = member[place]
+            count = _joined(founders, labels, count, (mass, sums, member))
+        elif lag:
+            count = _joined(parents[DEPTH - lag], labels, count, (mass, sums, member))
+        square, factor = 0.0, sizes[lag] / max(sizes[lag] - 1, 1)
+        for d in range(n):
+            means[lag, d] = 0.0
+        for place in range(count):
+            square += mass[place] * mass[place]
             for d in range(n):
-                sums[count, d] = weights[i] * deviations[d, i]
-            count += 1
-    own, own_mass, own_sums = labels[:count].copy(), mass[:count].copy(), sums[:count].copy()
-    own_count = _joined(founders, own, count, own_mass, own_sums)
-    squares[last] = _told(own_mass, own_sums, own_count, sizes[last], means[last], between[last])
-    families[last] = own_count
-    for lag in range(last):
-        if lag:
-            count = _joined(parents[DEPTH - lag], labels, count, mass, sums)
-        squares[lag] = _told(mass, sums, count, sizes[lag], means[lag], between[lag])
-        families[lag] = count
+                means[lag, d] += factor * sums[place, d] * sums[place, d]
+        counts[0, lag], counts[1, lag] = square, count
+        if lag == last - 1:
+            for d in range(n):
+                between[d] = 0.0
+                for place in range(count):
+                    between[d] += sums[place, d] * sums[place, d] / mass[place]
 
 
 @kernel(types.void(F3, F2, F2, F2))
@@ -170,30 +170,6 @@ def carry(excess: Array, across: Array, cov: Array, T: Array) -> None:
     for i in range(excess.shape[0]):
         congruence(found, T, excess[i], product)
         excess[i] = found
-
-
-@kernel(types.float64(F1, F1, F1))
-def weigh(logs: Array, gained: Array, weights: Array) -> float:
-    """Write weights (N,) that sum to one, and return the logarithm of the sum of exp(logs + gained).
-
-    It is -inf, and the weights are equal, where that is not a number above zero.
-    """
-    count, top = logs.size, -np.inf
-    for i in range(count):
-        weights[i] = logs[i] + gained[i]
-        top = max(top, weights[i])
-    if not np.isfinite(top):
-        weights[:] = 1.0 / count
-        return -np.inf
-    for i in range(count):
-        weights[i] -= top
-    exp_row(weights, weights)
-    total = 0.0
-    for i in range(count):
-        total += weights[i]
-    for i in range(count):
-        weights[i] /= total
-    return top + math.log(total)
 
 
 class Candidates(NamedTuple):
