@@ -62,7 +62,7 @@ MOST_LEVELS = 60
 # it can divide the present loss by `MOVE_GAIN`, and longer where the last one had gained less; what that left is forgotten at a
 # rate.  The cost is counted in normal numbers: those of the window, once and for each sweep by the acceptance of the last, and
 # in a step its own and as many as the rest of it takes.  (Measured: 30 to 38 ns in a move, 0.3 us and 40 ns a number in a step.)
-MOVE_GAIN, MOVE_WORTH, FORGOTTEN, STEP_WORK, LEAST_RATE = 1.5, 4.0, 0.98, 8.0, 0.3
+MOVE_GAIN, MOVE_WORTH, FORGOTTEN, STEP_WORK, LEAST_RATE = 1.5, 4.0, 0.98, 4.0, 0.3
 MOVE_CONTROL = (1.0, 1.2, 4.0, 0.4, 1.0)  # power, change, most sweeps, rho, share
 VARIANCE = 5.0  # that of a mean times N, in variances of the state, that the number of particles is chosen for
 MOST_GROWTH = 4
@@ -76,7 +76,7 @@ SURE, TRUSTED, MOST_TRUSTED, FORESEEN, LONGER, FASTER = 0.5, 4, 8, 1.3, 4.0, 2.0
 
 def init(prepared: Prepared, prior: Any) -> State:
     """Return draws of the prior with equal weights."""
-    system, count = prepared.system, prepared.rule.particles
+    system, count = prepared.system, prepared.rule.start
     gaussian = system.gaussian_prior(prior)
     if gaussian is not None:
         return begun(prepared, gaussian, count)
@@ -97,7 +97,7 @@ def _at_start(prepared: Prepared, particles: Array, first: Array, gaussian: tupl
     width = system.law.width if system.law is not None else system.factor.width  # type: ignore[union-attr]
     window = Window.begin(particles, first, gaussian, (width, len(prepared.motion.law[3])))
     logs, n = np.full(count, -np.log(count)), prepared.model.n
-    genealogy, control = Genealogy.begin(count, n), Control(variance=VARIANCE)
+    genealogy, control = Genealogy.begin(count, n), Control(variance=VARIANCE * count / prepared.rule.particles)
     return State(particles, logs, window, genealogy, control, np.zeros(n), np.zeros(system.n), np.ones(system.n))
 
 

@@ -101,6 +101,11 @@ class Scheme(NamedTuple):
     substeps: int
     stages: int
 
+    @property
+    def work(self) -> int:
+        """The evaluations of the drift; a kick with its normal numbers takes about as long as two."""
+        return (self.substeps + 1) * (self.stages + 2)
+
 
 @dataclass(frozen=True)
 class Motion:
@@ -185,12 +190,19 @@ class Motion:
             mean: the state (n,) about which the drift is linearised for the covariance of the noise.
             scale: standard deviations of the states (n,).
         """
+        return self.linearised(interval, scheme, values, mean, scale)[0]
+
+    def linearised(
+        self, interval: Interval, scheme: Scheme, values: Array, mean: Array, scale: Array
+    ) -> tuple[Events, Array]:
+        """Return the events of an interval, and df/dx (J, n, n) where the noise acts, with no entries where it has fields."""
         system, start, stop, count = self.system, interval.start, interval.stop, scheme.substeps
         length = stop - start
         if length <= 0:
             none = np.zeros((0, system.r if system.kind else system.n, 0))
             row = np.array([[start, start]])
-            return Events(row, np.array([[-1, 0, 4]]), np.zeros((1, 2, system.drift.width)), none, np.zeros((0, 3), np.int64))
+            rows, given = np.zeros((0, 3), np.int64), np.zeros((1, 2, system.drift.width))
+            return Events(row, np.array([[-1, 0, 4]]), given, none, rows), none
         step = length / count
         ends = np.append(start + (np.arange(count) + 0.5) * step, stop)
         places = np.full((count + 1, 3), -1)
@@ -205,12 +217,12 @@ class Motion:
         times = np.empty((len(ends), 2))
         times[0, 0], times[1:, 0], times[:, 1] = start, ends[:-1], ends
         given = self.given_numbers(interval, times, values)
-        roots = self._roots(interval, Flows(times, places, given), step, mean, scale)
+        roots, slopes = self._roots(interval, Flows(times, places, given), step, np.array([mean, scale]))
         coin = int(system.kind == ORDERED)
         width = roots.shape[2]
         rows = np.empty((count, 3), np.int64)
         rows[:, 0], rows[:, 1], rows[:, 2] = np.arange(count) * (width + coin), width, coin
-        return Events(times, places, given, roots, rows)
+        return Events(times, places, given, roots, rows), slopes
 
     def _inputs(self, interval: Interval, t: float, before: bool) -> Array | None:
         known = interval.inputs
@@ -257,24 +269,24 @@ class Motion:
             self._precisions[key] = system.precision(t, seen, self.theta, u)
         return self._precisions[key]
 
-    def _roots(self, interval: Interval, flows: Flows, step: float, mean: Array, scale: Array) -> Array:
-        """Return the roots of the noise of all substeps, (J, n, d), or (J, r, d) for the coefficients of fields."""
+    def _roots(self, interval: Interval, flows: Flows, step: float, about: Array) -> tuple[Array, Array]:
+        """Return the roots of the noise of all substeps, (J, n, d), or (J, r, d) for the coefficients of fields, and slopes."""
         system, (times, places, given) = self.system, flows
         kicks = np.flatnonzero(places[:, 0] >= 0)
         if system.kind != ADDITIVE:
             if not system.timed and system.cross is None:
-                return np.repeat(self._constant_root * np.sqrt(step), len(kicks), axis=0)
+                return np.repeat(self._constant_root * np.sqrt(step), len(kicks), axis=0), np.zeros((0, 0, 0))
             found = roots(self._at_kicks(interval, times[kicks, 1], self._own_noise)) * np.sqrt(step)
-            return found if system.timed else np.repeat(found, len(kicks), axis=0)
+            return found if system.timed else np.repeat(found, len(kicks), axis=0), np.zeros((0, 0, 0))
         if system.timed or system.cross is not None:
             G = self._at_kicks(interval, times[kicks, 1], self.covariance)
         else:
             G = self._constant_covariance[None]
         A = self.constant_matrix if system.affine else np.zeros((0, 0))
-        out = np.empty((len(kicks), system.n, system.n))
+        slopes, out = np.empty((2, len(kicks), system.n, system.n))
         none = np.zeros((0, system.n, 0)), np.zeros((len(kicks), 3), np.int64)
-        width = noise_kernels.kick_roots(self.arrays, (times, places, given, *none), A, step, mean, scale, G, out)
-        return np.ascontiguousarray(out[:, :, :width])
+        width = noise_kernels.kick_roots(self.arrays, (times, places, given, *none), A, step, about, G, slopes, out)
+        return np.ascontiguousarray(out[:, :, :width]), slopes
 
     @cached_property
     def _constant_root(self) -> Array:
@@ -343,42 +355,47 @@ def steps_of(motion: Motion, interval: Interval, values: Array, pilots: Pilots, 
         size = 0.5 * float(np.abs(motion.constant_matrix).sum(axis=1).max()) * (interval.stop - interval.start)
         if size**5 / 60 <= EXACT:
             return Steps(Scheme(1, 4), np.zeros(system.n), size**5 / 60, size**5 / 60)
-    n, count = system.n, max(1, guess)
-    shift, error, surely = np.full(n, np.nan), np.inf, np.inf
+    count, found = max(1, guess), Steps(Scheme(max(1, guess), 4), np.full(system.n, np.nan), np.inf, np.inf)
     for turn in range(4):
-        found = _time_errors(motion, interval, values, pilots._replace(key=pilots.key + turn), count)
-        (other, fewer, other_surely), (error, shift, surely) = found
-        if not np.isfinite(error):
+        errors = _time_errors(motion, interval, values, pilots._replace(key=pilots.key + turn), count)
+        # The flow is of a higher order than the noise: fewer substeps than half of what was measured may have any error.
+        least = -(-count // 2) if turn == 3 else 1
+        choices = [_needed(Scheme(count, stages), *one, pilots.allowed, least) for stages, one in errors.items()
+                   if np.isfinite(one[0])]  # fmt: skip
+        if not choices:
             if count >= MOST_SUBSTEPS:
                 break
             count = min(4 * count, MOST_SUBSTEPS)
             continue
-        wanted = int(np.clip(np.ceil(count * np.sqrt(error / pilots.allowed)), 1, MOST_SUBSTEPS))
-        if 2 * wanted < count and turn < 3:
-            count, shift, error, surely = wanted, shift * (count / wanted) ** 2, error * (count / wanted) ** 2, np.inf
-            continue
-        reduced = (count / wanted) ** 2
-        if other * reduced <= pilots.allowed:
-            return Steps(Scheme(wanted, 2), fewer * reduced, other * reduced, other_surely * reduced)
-        if wanted <= 2 * count:
-            return Steps(Scheme(wanted, 4), shift * reduced, error * reduced, surely * reduced)
-        count, shift, error, surely = wanted, shift * reduced, error * reduced, surely * reduced
-    return Steps(Scheme(count, 4), shift, error, surely)
+        found = min(choices, key=lambda one: (max(one.error, 1.001 * pilots.allowed), one.scheme.work, one.scheme.substeps))
+        wanted = found.scheme.substeps
+        if count <= 2 * wanted <= 4 * count:
+            break
+        count = max(wanted, int(np.sqrt(count * wanted)))
+    return found
+
+
+def _needed(measured: Scheme, error: float, shift: Array, surely: float, allowed: float, least: int) -> Steps:
+    """Return the substeps that an error of second order in their length needs, at least so many."""
+    count = measured.substeps
+    wanted = int(np.clip(np.ceil(count * np.sqrt(error / allowed)), least, MOST_SUBSTEPS))
+    share = (count / wanted) ** 2
+    return Steps(Scheme(wanted, measured.stages), share * shift, share * error, share * surely)
 
 
 def _time_errors(
     motion: Motion, interval: Interval, values: Array, pilots: Pilots, count: int
-) -> tuple[tuple[float, Array, float], tuple[float, Array, float]]:
+) -> dict[int, tuple[float, Array, float]]:
     """Return the errors of `count` substeps of 2 and of 4 stages, by the difference from twice as many, times 4/3.
 
-    The largest error of a mean or a deviation, in standard deviations, the shift of the mean (n,), and the error with that of the
+    By the number of stages: the largest error of a mean or a deviation, in standard deviations, the shift of the mean (n,), and the error with that of the
     pilots.
     """
     system, mean, scale = motion.system, pilots.mean, pilots.scale
-    coarse, fine = (motion.events(interval, Scheme(k, 4), values, mean, scale) for k in (count, 2 * count))
+    (coarse, slopes), (fine, _) = (motion.linearised(interval, Scheme(k, 4), values, mean, scale) for k in (count, 2 * count))
     noise = np.empty((fine.width, pilots.states.shape[1]))
     normals(key_of(pilots.key), 0, noise.shape[1], noise)
-    shared = _coarse_noise(motion, coarse, fine, noise)
+    shared = _coarse_noise(motion, coarse, fine, noise, 0.25 * (interval.stop - interval.start) / count * slopes)
     y, finer = motion.advanced(fine, pilots.states, noise)
 
     def change(stages: int) -> tuple[float, Array, float]:
@@ -389,15 +406,21 @@ def _time_errors(
         step_errors(StepErrors(pilots.states, x, gained, y, finer, system.angles, scale), LEAST_CONTRACTION, shift, largest)
         return 4 / 3 * float(largest[0]), 4 / 3 * shift, 4 / 3 * float(largest[1])
 
-    return change(2), change(4)
+    return {2: change(2), 4: change(4)}
 
 
-def _coarse_noise(motion: Motion, coarse: Events, fine: Events, noise: Array) -> Array:
-    """Return the noise of the substeps that makes the same kicks as that of their halves."""
+def _coarse_noise(motion: Motion, coarse: Events, fine: Events, noise: Array, carried: Array) -> Array:
+    """Return the noise of the substeps that makes the same kicks as that of their halves, carried to the middle.
+
+    `carried` (J, n, n) is df/dx times a quarter of a substep.  What the linearised flow does to the kicks on their way says
+    nothing about the time step, and in the mean of few pilots would hide what does.
+    """
     count, pilots = len(coarse.rows), noise.shape[1]
     if motion.system.kind == ADDITIVE:
         kicks = fine.roots @ noise.reshape(2 * count, -1, pilots) if fine.width else np.zeros((2 * count, motion.system.n, pilots))
-        shared = np.linalg.pinv(coarse.roots, rcond=1e-6) @ (kicks[::2] + kicks[1::2])
+        both, apart = kicks[::2] + kicks[1::2], kicks[::2] - kicks[1::2]
+        both += carried @ (apart + 0.5 * carried @ both)
+        shared = np.linalg.pinv(coarse.roots, rcond=1e-6) @ both
         return np.ascontiguousarray(shared.reshape(coarse.width, pilots))
     shared = np.zeros((coarse.width, pilots))
     for j in range(count):

@@ -94,7 +94,7 @@ class State(NamedTuple):
 
 @dataclass(frozen=True)
 class Rule:
-    """The options: the particles at the start, their largest number, the wanted standard error or none, and the seed.
+    """The options: the smallest and the largest number of particles, the wanted standard error or none, and the seed.
 
     `split`: whether particles carry a Kalman filter for linear states even where draws leave a smaller error.
     """
@@ -104,6 +104,11 @@ class Rule:
     tolerance: float | None
     seed: int
     split: bool
+
+    @property
+    def start(self) -> int:
+        """The number of particles at the start: what the first observations lose is remembered longest."""
+        return self.particles if self.tolerance is None else self.most
 
 
 @dataclass(frozen=True)

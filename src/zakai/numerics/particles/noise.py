@@ -183,8 +183,8 @@ def slopes(program: Any, box: Any, x: Array, scale: Array, time: float, given: A
     _slopes(program, block_of(program), box, x, _STEP * scale, time, given, out)
 
 
-@kernel(types.int64(MOTION, EVENTS, F2, types.float64, F1, F1, F3, F3))
-def kick_roots(motion: Any, events: Any, A: Array, length: float, mean: Array, scale: Array, G: Array, out: Array) -> int:
+@kernel(types.int64(MOTION, EVENTS, F2, types.float64, F2, F3, F3, F3))
+def kick_roots(motion: Any, events: Any, A: Array, length: float, about: Array, G: Array, slopes: Array, out: Array) -> int:
     """Write the roots (J, n, n) of the noise of all kicks, and return how many of their columns are not all zero.
 
     Args:
@@ -192,17 +192,17 @@ def kick_roots(motion: Any, events: Any, A: Array, length: float, mean: Array, s
         events: the events of an interval, without roots.
         A: the matrix (n, n) of an affine drift, or (0, 0), where it is computed along the path of a state.
         length: of a substep.
-        mean: the state (n,) at the start.
-        scale: standard deviations (n,) of the state.
+        about: the state at the start, and its standard deviations (2, n).
         G: the covariance of the noise per unit time at each kick (J, n, n), or at all (1, n, n).
+        slopes: receives df/dx (J, n, n) at the kicks.
         out: receives the roots.
     """
     times, places, given = events[0], events[1], events[2]
-    n, width = mean.size, 0
+    n, width, mean, scale = about.shape[1], 0, about[0], about[1]
     blocks = (block_of(motion[0]), block_of(motion[1]), block_of(motion[4]))
     buffers = buffers_of(motion, events)
     x, none, at = np.zeros((motion[0][3].size, BLOCK)), np.empty((1, BLOCK)), np.empty(n)
-    slope, Q, pivots = np.empty((n, n)), np.empty((n, n)), np.empty(n, np.int64)
+    Q, pivots = np.empty((n, n)), np.empty(n, np.int64)
     for d in range(n):
         x[d, 0] = mean[d]
     for e in range(places.shape[0]):
@@ -211,6 +211,7 @@ def kick_roots(motion: Any, events: Any, A: Array, length: float, mean: Array, s
         j = places[e, 0]
         if j < 0:
             continue
+        slope = slopes[j]
         if A.size:
             slope[:] = A
         else:
