@@ -393,20 +393,36 @@ def _time_errors(
     """
     system, mean, scale = motion.system, pilots.mean, pilots.scale
     (coarse, slopes), (fine, _) = (motion.linearised(interval, Scheme(k, 4), values, mean, scale) for k in (count, 2 * count))
-    noise = np.empty((fine.width, pilots.states.shape[1]))
+    noise, start = np.empty((fine.width, pilots.states.shape[1])), pilots.states
     normals(key_of(pilots.key), 0, noise.shape[1], noise)
+    if system.kind != ADDITIVE:
+        noise, start = _exchanged(fine, noise, start)
     shared = _coarse_noise(motion, coarse, fine, noise, 0.25 * (interval.stop - interval.start) / count * slopes)
-    y, finer = motion.advanced(fine, pilots.states, noise)
+    y, finer = motion.advanced(fine, start, noise)
 
     def change(stages: int) -> tuple[float, Array, float]:
         places = coarse.places.copy()
         places[:, 2] = stages
-        x, gained = motion.advanced(coarse._replace(places=places), pilots.states, shared)
+        x, gained = motion.advanced(coarse._replace(places=places), start, shared)
         shift, largest = np.empty(system.n), np.empty(2)
-        step_errors(StepErrors(pilots.states, x, gained, y, finer, system.angles, scale), LEAST_CONTRACTION, shift, largest)
+        step_errors(StepErrors(start, x, gained, y, finer, system.angles, scale), LEAST_CONTRACTION, shift, largest)
         return 4 / 3 * float(largest[0]), 4 / 3 * shift, 4 / 3 * float(largest[1])
 
     return {2: change(2), 4: change(4)}
+
+
+def _exchanged(fine: Events, noise: Array, start: Array) -> tuple[Array, Array]:
+    """Return pairs of pilots with equal starts, where one has the noise of both halves of each substep in the other order.
+
+    Which half has which noise moves the end by a first-order difference that says nothing about the time step; in pairs it
+    cancels.
+    """
+    half, width, count = start.shape[1] // 2, int(fine.rows[0, 1]), len(fine.rows)
+    parts = noise.reshape(count, -1, noise.shape[1])[:, :, :half]
+    other = parts.copy()
+    other[0::2, :width], other[1::2, :width] = parts[1::2, :width], parts[0::2, :width]
+    both = np.concatenate([parts, other], axis=2).reshape(len(noise), -1)
+    return both, np.concatenate([start[:, :half], start[:, :half]], axis=1)
 
 
 def _coarse_noise(motion: Motion, coarse: Events, fine: Events, noise: Array, carried: Array) -> Array:
