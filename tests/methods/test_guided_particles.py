@@ -460,3 +460,13 @@ def test_the_time_error_between_two_modes_does_not_grow_where_no_particle_is():
     result, exact = zakai.filter(model, record, PARTICLES, particles=2000), zakai.filter(model, record, "yau-yau")
     assert np.abs(result.mean - exact.mean).max() < 0.15
     assert np.nanmax(result.health["time_error"]) < 0.1
+
+
+def test_the_number_of_particles_begins_high_and_changes_only_where_they_are_resampled():
+    model = zakai.Model(**{"observation_kind": "samples", **OSCILLATOR, "observation": ["x"], "observation_noise": [["0.25"]]})
+    health = zakai.filter(model, record_of(model, 40, 0.3), PARTICLES).health
+    count, size = health["particles"][1:], health["effective_sample_size"][1:]
+    assert count[0] == 4 * np.ceil(5 / 0.03**2)
+    assert count[-1] < 0.5 * count[0]
+    changed = np.flatnonzero(count[1:] != count[:-1])
+    assert len(changed) and np.all(size[changed] < 0.5 * count[changed])

@@ -29,7 +29,6 @@ from zakai.methods.particles.interval import (
     TIME_ERROR,
     Events,
     Interval,
-    Motion,
     Observed,
     Pilots,
     Scheme,
@@ -111,10 +110,11 @@ def reduced(state: State) -> State:
 class Advanced(NamedTuple):
     """Particles after an interval, with what was needed.
 
-    `weights` (N,) are those of the particles, `gained` is the increment of the log-likelihood, `noise` (D, N) that of the interval, `predicted` (n',) the spread of the
-    coordinates before the weights of the observation act, `deviations` (n,) those of the states before it, `acceptance` that of
-    moves between powers of the likelihood; the next one is the share of the particles that left every bounded set, and `unseen`
-    says that few particles are left by an observation that says nothing of the noise.
+    `weights` (N,) are those of the particles, `gained` is the increment of the log-likelihood, `noise` (D, N) that of the
+    interval, `predicted` (n',) the spread of the coordinates before the weights of the observation act, `deviations` (n,)
+    those of the states before it, `acceptance` that of moves between powers of the likelihood; the next one is the share of
+    the particles that left every bounded set, and `unseen` says that few particles are left by an observation that says
+    nothing of the noise.
     """
 
     cloud: Cloud
@@ -162,7 +162,7 @@ def _step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[Stat
     wanted, size = _wanted(rule, len(weights), control.variance), effective(weights)
     if size < HOPELESS * len(weights):  # more of them would be of no use
         wanted = min(wanted, len(weights))
-    if size < RESAMPLE_BELOW * len(weights) or wanted != len(weights):
+    if size < RESAMPLE_BELOW * len(weights):  # a change of their number alone would resample weights that the next may undo
         cloud, _ = cloud.resampled(weights, wanted, prepared.key(number, RESAMPLING))
     start, narrow = cloud, control.narrow
     for last_turn in (False, True):
@@ -453,4 +453,4 @@ def _wanted(rule: Rule, count: int, variance: float) -> int:
     need = variance / rule.tolerance**2
     if count / 1.3 < need < 1.2 * count:
         return count
-    return int(np.clip(min(max(need, 0.7 * count), 1.5 * count), rule.particles, rule.most))
+    return int(np.clip(min(need, 1.5 * count), rule.particles, rule.most))

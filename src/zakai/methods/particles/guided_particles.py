@@ -48,7 +48,8 @@ def prepare(
         tolerance: the wanted standard error of a mean, in standard deviations of the state; it decides the number of particles.
             None is the default, as in every method.
         particles: a fixed number of particles instead.
-        most_particles: the largest number; by default four times that of the start.
+        most_particles: the largest number, with which the filter begins; by default four times what the tolerance needs for
+            states that forget.
         seed: of the draws.
         split: whether particles carry a Kalman filter for the states that are linear given the others; by default where it
             pays.

@@ -11,9 +11,9 @@ import numpy as np
 
 from zakai.methods.particles.programs import Array, Expressions
 from zakai.methods.particles.system import System, roots
+from zakai.numerics.particles import noise as noise_kernels
 from zakai.numerics.particles.chunks import over_chunks
 from zakai.numerics.particles.formulas import evaluate
-from zakai.numerics.particles import noise as noise_kernels
 from zakai.numerics.particles.motion import ADDITIVE, ORDERED, UPDATE, Arrival, advance
 from zakai.numerics.particles.random import key_of, normals
 from zakai.numerics.particles.step_errors import StepErrors, step_errors
@@ -388,8 +388,8 @@ def _time_errors(
 ) -> dict[int, tuple[float, Array, float]]:
     """Return the errors of `count` substeps of 2 and of 4 stages, by the difference from twice as many, times 4/3.
 
-    By the number of stages: the largest error of a mean or a deviation, in standard deviations, the shift of the mean (n,), and the error with that of the
-    pilots.
+    By the number of stages: the largest error of a mean or a deviation, in standard deviations, the shift of the mean (n,),
+    and the error with that of the pilots.
     """
     system, mean, scale = motion.system, pilots.mean, pilots.scale
     (coarse, slopes), (fine, _) = (motion.linearised(interval, Scheme(k, 4), values, mean, scale) for k in (count, 2 * count))
@@ -433,7 +433,9 @@ def _coarse_noise(motion: Motion, coarse: Events, fine: Events, noise: Array, ca
     """
     count, pilots = len(coarse.rows), noise.shape[1]
     if motion.system.kind == ADDITIVE:
-        kicks = fine.roots @ noise.reshape(2 * count, -1, pilots) if fine.width else np.zeros((2 * count, motion.system.n, pilots))
+        if not fine.width:
+            return np.zeros((0, pilots))
+        kicks = fine.roots @ noise.reshape(2 * count, -1, pilots)
         both, apart = kicks[::2] + kicks[1::2], kicks[::2] - kicks[1::2]
         both += carried @ (apart + 0.5 * carried @ both)
         shared = np.linalg.pinv(coarse.roots, rcond=1e-6) @ both

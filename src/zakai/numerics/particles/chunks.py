@@ -25,7 +25,10 @@ def _pool() -> ThreadPoolExecutor:
 
 
 def over_chunks(work: Callable[[int, int], T], count: int) -> list[T]:
-    """Return what `work(low, high)` returns for parts of `count` particles that are multiples of `CHUNK`, on all cores where there are many."""
+    """Return what `work(low, high)` returns for parts of `count` particles, on all cores where these are many.
+
+    The parts are multiples of `CHUNK`.
+    """
     cores = _cores()
     if count <= _ALONE or cores == 1:
         return [work(0, count)]
