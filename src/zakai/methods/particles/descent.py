@@ -10,10 +10,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from zakai.methods.particles.errors import DEPTH, Genealogy
+from zakai.methods.particles.errors import Genealogy
 from zakai.methods.particles.interval import Events, Motion
 from zakai.methods.particles.programs import Array
 from zakai.methods.particles.window import Window, taken
+from zakai.numerics.particles.population import DEPTH
 
 LAGS = (0, 1, 2, 4, 8, 16)  # resamplings back to the common ancestors by which families of draws are told apart
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from zakai.methods.particles.errors import DEPTH
 from zakai.methods.particles.programs import Array
 from zakai.methods.particles.state import Prepared, State
 from zakai.methods.particles.window import INTERVALS, Window
 from zakai.numerics.particles.motion import UPDATE
+from zakai.numerics.particles.population import DEPTH
 
 
 def valid(prepared: Prepared, state: State) -> bool:
