@@ -283,6 +283,8 @@ class Target:
         spread = np.sqrt(np.mean(apart**2, axis=1) if weights is None else apart**2 @ weights)
         spread = _STEP * np.maximum(spread, 1e-9 * (1.0 + np.abs(centre)))
         moving = 0 if self.prior is not None else n
+        rows = self.events.rows[self.events.rows[:, 2] > 0]
+        coins = rows[:, 0] + rows[:, 1] + (0 if self.prior is None else self.prior[1].shape[1])  # of which no path is smooth
         gain: Array = np.zeros((D, n))
         posterior = _Precision.of([np.zeros((0, D))])
         for _ in range(rounds):
@@ -296,24 +298,25 @@ class Target:
                 begin[np.arange(n), 1 + D + np.arange(n)] += spread
             ends = np.zeros((len(self.times), n, points.shape[1]))
             self.motion.advanced(self.events, np.ascontiguousarray(begin), np.ascontiguousarray(points), ends)
-            rows, right, across = list[Array](), np.zeros(D), np.zeros((D, moving))
+            informing, right, across = list[Array](), np.zeros(D), np.zeros((D, moving))
             before = begin
             for k, end in enumerate(ends):
                 x = end if self.motion.system.sampled else 0.5 * (before + end)
                 before = end
                 J = (x[:, 1 : 1 + D] - x[:, :1]) / _STEP
+                J[:, coins] = 0.0
                 scale = np.sqrt(np.sum(J**2, axis=1)) + spread / _STEP
                 slope, information = self._information(k, x[:, 0], scale)
                 factor = power if k == len(ends) - 1 else 1.0
                 seen = np.sqrt(factor) * root(information).T
                 inner = seen @ J
-                rows.append(inner)
+                informing.append(inner)
                 right += J.T @ (factor * slope) + inner.T @ (inner @ point)
                 if moving:
                     across += inner.T @ (seen @ ((x[:, 1 + D :] - x[:, :1]) / spread))
-            if not all(np.isfinite(part).all() for part in (*rows, right, across)):
+            if not all(np.isfinite(part).all() for part in (*informing, right, across)):
                 return None
-            posterior = _Precision.of([np.zeros((0, D)), *rows])
+            posterior = _Precision.of([np.zeros((0, D)), *informing])
             point = posterior.solve(right)
         if moving:
             gain = -posterior.solve(across)
