@@ -69,8 +69,9 @@ REPEATED, NARROWEST = 2.0, 0.02  # excess of the time error at which an interval
 # Of the time error: the share of the allowed one below which it holds in so many more intervals; in how many it does at most,
 # twice as many each time, where it was no more than so many times the substeps that were expected; the ratio of errors by length
 # up to which it holds.  It does not where the drift moves the mean by more than a deviation in the interval, and so many times as
-# fast as where it was measured.
-SURE, TRUSTED, MOST_TRUSTED, FORESEEN, LONGER, FASTER = 0.5, 4, 8, 1.3, 4.0, 2.0
+# fast as where it was measured, or where df/dx is so many times as large: the error is of the third order in it, and twice it is
+# within what `SURE` leaves.
+SURE, TRUSTED, MOST_TRUSTED, FORESEEN, LONGER, FASTER, STEEPER = 0.5, 4, 8, 1.3, 4.0, 2.0, 2 ** (1 / 3)
 
 
 def init(prepared: Prepared, prior: Any) -> State:
@@ -272,7 +273,10 @@ def _steps(
     allowed = _allowed(control, len(state.log_weights))
     needed = control.substeps * np.sqrt(control.error * ratio / allowed)
     guess = max(1, int(np.ceil(needed))) if needed <= MOST_SUBSTEPS else max(1, control.substeps)
-    alike = pace * length <= 1.0 or pace <= FASTER * control.pace
+    alike, steepness = pace * length <= 1.0, 0.0
+    if not alike:  # the mean moves to where the error may be another one
+        steepness = prepared.motion.steepness(interval, values, mean, scale)
+        alike = pace <= FASTER * control.pace and steepness <= STEEPER * control.steepness
     if control.trusted and alike and ratio <= LONGER and guess <= MOST_SUBSTEPS:
         ratio *= (control.substeps / guess) ** 2
         error = control.error * ratio
@@ -289,7 +293,8 @@ def _steps(
     trusted = max(trusted, TRUSTED) if found.surely <= SURE * allowed else trusted
     trusted = 0 if jumps else trusted  # of other inputs than those that the next interval begins with
     return found, control._replace(
-        substeps=count, stages=stages, error=found.error, length=length, trusted=trusted, granted=trusted, pace=pace
+        substeps=count, stages=stages, error=found.error, length=length, trusted=trusted, granted=trusted, pace=pace,
+        steepness=steepness,
     )
 
 

@@ -180,6 +180,12 @@ class Motion:
         f = self.values(self.arrays[0], mean[:, None], interval.start, given[0, 0])[: len(mean), 0]
         return float(np.nan_to_num(np.abs(f) / scale, nan=np.inf).max())
 
+    def steepness(self, interval: Interval, values: Array, mean: Array, scale: Array) -> float:
+        """Return the norm of df/dx at a mean (n,) at the start of an interval, with the states in deviations (n,)."""
+        given = self.given_numbers(interval, np.array([[interval.start, interval.stop]]), values)
+        A = self.matrices(mean[None], scale, interval.start, given[0, 0])[0]
+        return float(np.linalg.norm(A * scale / scale[:, None]))
+
     def events(self, interval: Interval, scheme: Scheme, values: Array, mean: Array, scale: Array) -> Events:
         """Return the events of an interval in equal substeps.
 

@@ -23,7 +23,7 @@ class Control(NamedTuple):
     """What decides the next step beside the particles.
 
     `interval` counts intervals; `substeps` with `stages`, whose `error` was measured in an interval of this `length`, where the
-    drift moved the mean at this `pace`, and is `trusted` in so many more of those that were `granted`; `narrow` the ratio of the
+    drift moved the mean at this `pace` and df/dx had this `steepness`, and is `trusted` in so many more of those that were `granted`; `narrow` the ratio of the
     deviations after and before the last observation, `variance` of a mean times N, `losses` the sum of its means and `work` that
     of steps and moves, `excess` what has added up since the last move beyond `floor`, what that has left; `present` is the part
     of the last step, and of `known` such parts steps have left `remembered` to the next ones; `rate` is the acceptance of the
@@ -48,6 +48,7 @@ class Control(NamedTuple):
     doubtful_until: int = 0
     shifted: float = 0.0
     pace: float = 0.0
+    steepness: float = 0.0
     present: float = 0.0
     known: float = 0.0
     remembered: float = 0.0
