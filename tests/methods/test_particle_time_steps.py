@@ -1,0 +1,84 @@
+"""When `guided-particles` measures its time step again, and when it moves the past, seen from means and health figures."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import zakai
+
+PARTICLES = "guided-particles"
+FASTER_AT_4 = "-(1 + 200/(1 + exp(-40*({} - 4))))*x - 0.1*v"
+
+
+def test_the_past_is_moved_only_where_the_state_remembers_it():
+    # Precise observations leave few ancestors, but neither state remembers more than a few intervals.
+    model = zakai.Model(
+        state=["x", "y"], drift=["-x - x**3", "-y + x"], diffusion=[["1", "0"], ["0", "1"]], observation=["x"],
+        observation_kind="samples", observation_noise=[["0.003"]],
+        prior={"kind": "gaussian", "mean": [0.0, 0.0], "cov": [0.3, 0.3]},
+    )  # fmt: skip
+    _, record = zakai.simulate(model, np.arange(1, 61) * 0.4, seed=3)
+    result = zakai.filter(model, record, PARTICLES, particles=500, split=False, keep="moments")
+    assert np.nanmin(result.health["founders"]) < 50  # lineages of the start are lost
+    assert np.nansum(result.health["moved"]) == 0
+
+
+def test_a_measured_time_step_is_kept_while_it_is_right():
+    # Without observations the shift of the mean by the time step is that of the last measurement, up to what the interval forgets.
+    model = zakai.Model(
+        state=["x"], drift=["-10*x - x**3"], diffusion=[["2"]], observation=["x"], observation_kind="samples",
+        observation_noise=[["0.1"]], prior={"kind": "gaussian", "mean": [0.0], "cov": [0.2]},
+    )  # fmt: skip
+    record = zakai.Record(np.arange(1.0, 41.0), np.full((40, 1), np.nan), "samples")
+    result = zakai.filter(model, record, PARTICLES, particles=1000, keep="moments")
+    shift = (result.health["time_error"] * np.sqrt(result.variance[:, 0]))[1:]
+    kept = np.isclose(shift[1:], shift[:-1], rtol=1e-3)
+    assert 10 < kept.sum() < 39  # some are kept, and not for ever
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_a_time_step_is_measured_again_where_the_motion_becomes_faster():
+    keys = {
+        "drift": ["v", FASTER_AT_4.format("t")], "diffusion": [["0"], ["0.05"]], "observation": ["x"],
+        "observation_kind": "samples", "observation_noise": [["0.01"]],
+    }  # fmt: skip
+    model = zakai.Model(state=["x", "v"], prior={"kind": "gaussian", "mean": [1.0, 0.0], "cov": [0.01, 0.01]}, **keys)
+    _, record = zakai.simulate(model, np.arange(1, 51) * 0.1, seed=3, substeps=200)
+    result, exact = zakai.filter(model, record, PARTICLES, particles=2000), zakai.filter(model, record, "kalman-bucy")
+    apart = np.abs(result.mean - exact.mean)[1:] / np.sqrt(exact.variance[1:])
+    assert apart.max() < 0.5  # with the step of the slow motion it is more than three
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_a_time_step_is_measured_again_where_the_drift_becomes_steeper_at_the_same_speed():
+    # The first state is the time: it moves by many of its deviations in an interval, always at the same speed.
+    prior = {"kind": "gaussian", "mean": [0.0, 0.0, 0.0], "cov": [1e-6, 1.0, 1.0]}
+    model = zakai.Model(
+        state=["c", "x", "v"], drift=["1", "v", FASTER_AT_4.format("c")], diffusion=[["0"], ["0"], ["0.5"]], observation=["x"],
+        observation_kind="samples", observation_noise=[["1.0"]], prior=prior,
+    )  # fmt: skip
+    clock = zakai.Model(
+        state=["x", "v"], drift=["v", FASTER_AT_4.format("t")], diffusion=[["0"], ["0.5"]], observation=["x"],
+        observation_kind="samples", observation_noise=[["1.0"]],
+        prior={"kind": "gaussian", "mean": [0.0, 0.0], "cov": [1.0, 1.0]},
+    )  # fmt: skip
+    _, record = zakai.simulate(clock, np.arange(1, 51) * 0.1, seed=3, substeps=200)
+    result = zakai.filter(model, record, PARTICLES, particles=2000, split=False)
+    exact = zakai.filter(clock, record, "kalman-bucy")
+    apart = np.abs(result.mean[:, 1:] - exact.mean)[1:] / np.sqrt(exact.variance[1:])
+    assert apart.max() < 0.3
+
+
+def test_fields_that_do_not_commute_are_guided_to_a_precise_observation():
+    # The order in which they act is drawn: it has no direction that the guide could follow.
+    model = zakai.Model(
+        state=["x", "y"], drift=["-x - x**3/5", "-y - y**3/5"], diffusion=[["0.5", "0"], ["0", "0.5*x"]], observation=["x", "y"],
+        observation_kind="samples", observation_noise=[["2e-3", "0"], ["0", "2e-3"]],
+        prior={"kind": "gaussian", "mean": [1.5, 0.0], "cov": [0.01, 0.01]},
+    )  # fmt: skip
+    _, record = zakai.simulate(model, np.arange(1, 9) * 0.2, seed=2, substeps=200)
+    result = zakai.filter(model, record, PARTICLES, particles=1000)
+    assert np.nansum(result.health["guided"]) == 8
+    assert np.nansum(result.health["tempering_levels"]) == 0
+    assert np.nanmin(result.health["effective_sample_size"]) > 300
