@@ -25,7 +25,7 @@ def test_the_past_is_moved_only_where_the_state_remembers_it():
 
 
 def test_a_measured_time_step_is_kept_while_it_is_right():
-    # Without observations the shift of the mean by the time step is that of the last measurement, up to what the interval forgets.
+    # The state forgets all in an interval, so that without observations the shift of the mean is that of the last measurement.
     model = zakai.Model(
         state=["x"], drift=["-10*x - x**3"], diffusion=[["2"]], observation=["x"], observation_kind="samples",
         observation_noise=[["0.1"]], prior={"kind": "gaussian", "mean": [0.0], "cov": [0.2]},

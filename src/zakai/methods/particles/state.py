@@ -22,13 +22,13 @@ from zakai.records.schedule import Schedule
 class Control(NamedTuple):
     """What decides the next step beside the particles.
 
-    `interval` counts intervals; `substeps` with `stages`, whose `error` was measured in an interval of this `length`, where the
-    drift moved the mean at this `pace` and df/dx had this `steepness`, and is `trusted` in so many more of those that were `granted`; `narrow` the ratio of the
-    deviations after and before the last observation, `variance` of a mean times N, `losses` the sum of its means and `work` that
-    of steps and moves, `excess` what has added up since the last move beyond `floor`, what that has left; `present` is the part
-    of the last step, and of `known` such parts steps have left `remembered` to the next ones; `rate` is the acceptance of the
-    last move, `doubtful_until` the number of resamplings until which standard errors are lower bounds, and `shifted` the variance
-    of the log-likelihood by the time step.
+    `interval` counts intervals; `substeps` with `stages`, whose `error` was measured in an interval of this `length`, where
+    the drift moved the mean at this `pace` and df/dx had this `steepness`, and is `trusted` in so many more of those that
+    were `granted`; `narrow` the ratio of the deviations after and before the last observation, `variance` of a mean times N,
+    `losses` the sum of its means and `work` that of steps and moves, `excess` what has added up since the last move beyond
+    `floor`, what that has left; `present` is the part of the last step, and of `known` such parts steps have left
+    `remembered` to the next ones; `rate` is the acceptance of the last move, `doubtful_until` the number of resamplings until
+    which standard errors are lower bounds, and `shifted` the variance of the log-likelihood by the time step.
     """
 
     interval: int = 0
