@@ -73,9 +73,9 @@ def run(
     *,
     states: int = 8,
     observations: int = 100,
-    counts: int = 3000,
-    particles: int = 10_000,
-    repeats: int = 20,
+    counts: int = 1000,
+    particles: int = 2000,
+    repeats: int = 5,
     seed: int = 0,
 ) -> Reproduction:
     """Run both experiments.
@@ -85,7 +85,7 @@ def run(
         pictures: where pictures go.
         states: those of Lorenz' system.
         observations: of Lorenz' system.
-        counts: the number of observations of the neuron.
+        counts: the number of observations of the neuron; the published figures are of 3,000.
         particles: the number of particles.
         repeats: the number of runs with other random numbers.
         seed: of the records; the runs have the seeds 0, 1, ...

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -86,10 +87,12 @@ def _motion(model: Model) -> NumericFunction:
     return kept(model, _motion, lambda: numpy_function([*model.drift, *model.covariance], model))
 
 
+@lru_cache(maxsize=32)
 def _directions(n: int, count: int) -> Array:
     return np.random.default_rng(1).standard_normal((count, n))
 
 
+@lru_cache(maxsize=32)
 def _far_points(n: int) -> Array:
     directions = _directions(n, DIRECTIONS)
     return FAR[:, None, None] * directions / np.linalg.norm(directions, axis=1, keepdims=True)
@@ -111,7 +114,7 @@ def _check_infinity(interval: Interval, mean: Array, cov: Array) -> None:
     model, at, _, start, length = interval
     n = model.n
     directions = _directions(n, DIRECTIONS)
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    directions = directions / np.linalg.norm(directions, axis=1, keepdims=True)
     noise = np.nan_to_num(at(mean, start)[n:].reshape(n, n))
     if _calm(interval, mean, _root(cov + noise * length), directions):
         return
