@@ -183,7 +183,7 @@ class Motion:
     def steepness(self, interval: Interval, values: Array, mean: Array, scale: Array) -> float:
         """Return the norm of df/dx at a mean (n,) at the start of an interval, with the states in deviations (n,)."""
         given = self.given_numbers(interval, np.array([[interval.start, interval.stop]]), values)
-        A = self.matrices(mean[None], scale, interval.start, given[0, 0])[0]
+        A = self.matrix(mean, scale, interval.start, given[0, 0])
         return float(np.linalg.norm(A * scale / scale[:, None]))
 
     def events(self, interval: Interval, scheme: Scheme, values: Array, mean: Array, scale: Array) -> Events:
