@@ -7,8 +7,8 @@ from typing import NamedTuple
 import numpy as np
 
 from zakai import _registry
-from zakai.methods.system.escape import EscapeError
-from zakai.methods.system.escape_of_states import check_escape
+from zakai.methods.system.escape import EscapeError, divisors_of
+from zakai.methods.system.escape_of_states import check_escape, growing
 from zakai.models.model import Model
 from zakai.records.schedule import Schedule
 
@@ -38,8 +38,9 @@ def notes_on_escape(
     if method not in UNCHECKED:
         return []
     system = _System(model, schedule, theta)
+    rows = range(len(schedule)) if divisors_of(model) is not None else np.flatnonzero(growing(system, slice(None))).tolist()
     try:
-        for k in range(len(schedule)):
+        for k in rows:
             check_escape(system, k, lambda k=k: (mean[k], cov[k]))  # type: ignore[misc]
     except EscapeError as error:
         return [str(error).removeprefix(f"{model.source}: ")]

@@ -17,6 +17,7 @@ from zakai.numerics.escape import share_that_escapes
 Array = Any
 RARE = 1e-2  # share of paths that may escape, which is ten times the default tolerance
 DIRECTIONS = 64
+TOGETHER = 64  # intervals in which the drift far out is seen together
 CALM = 5.0, 2.5  # standard deviations of the prediction: where the drift is seen, and how far it may move a path from the mean's
 PATH_STEPS = 2  # Runge-Kutta steps of the mean's path in half of an interval
 SAMPLES = 256  # points of the density among which poles are sought
@@ -60,11 +61,8 @@ def check_escape(prepared: Any, k: int, moments: Callable[[], tuple[Array, Array
         u = None if inputs is None else inputs.at(np.minimum(t, np.nextafter(start + length, start)), hold)
         return function(points, t, theta, u)
 
-    def growing() -> bool:
-        return _grows(at(_far_points(model.n), start + 0.5 * length)[..., : model.n])
-
     with np.errstate(all="ignore"):
-        grows = infinity and (growing() if _varies(model) else kept(model, check_escape, growing, theta.tobytes(), 8))
+        grows = infinity and bool(growing(prepared, slice(k, k + 1))[0])
         if not grows and divisors is None:
             return
         mean, cov = moments()
@@ -75,6 +73,26 @@ def check_escape(prepared: Any, k: int, moments: Callable[[], tuple[Array, Array
         if divisors is not None:
             points = mean + _directions(model.n, SAMPLES) @ _root(cov).T
             _check_poles(Interval(model, at, k, start, length), points, at(points, start + 0.5 * length, divisors))
+
+
+def growing(prepared: Any, rows: slice) -> Array:
+    """Return in which of some intervals d log |x| / dt may grow without limit (K,).
+
+    Args:
+        prepared: a model, a schedule and parameters.
+        rows: the intervals.
+    """
+    model, schedule, theta = prepared.model, prepared.schedule, prepared.theta.real
+    middles = schedule.starts[rows] + 0.5 * schedule.lengths[rows]
+    if not _varies(model):
+        whole = kept(model, growing, lambda: _grows(model, theta, middles[:1], None)[0], theta.tobytes(), 8)
+        return np.full(len(middles), whole)
+    found = [np.zeros(0, bool)]
+    for first in range(0, len(middles), TOGETHER):
+        times = middles[first : first + TOGETHER]
+        u = None if schedule.inputs is None else schedule.inputs.at(times, model.input_hold)
+        found.append(_grows(model, theta, times, u))
+    return np.concatenate(found)
 
 
 @once_for_a_model
@@ -98,11 +116,16 @@ def _far_points(n: int) -> Array:
     return FAR[:, None, None] * directions / np.linalg.norm(directions, axis=1, keepdims=True)
 
 
-def _grows(drift: Array) -> bool:
-    """Return whether d log |x| / dt may grow without limit, from the drift (R, D, n) at the far points."""
-    rates = np.einsum("rdi,rdi->rd", drift, _far_points(drift.shape[-1])) / FAR[:, None] ** 2
-    rates = np.where(np.isnan(rates), np.inf * np.isinf(drift).any(axis=-1), rates).max(axis=1)
-    return bool(rates.max() > FASTER * max(rates[0], 0.0) and rates.max() > 1e-6)
+def _grows(model: Model, theta: Array, times: Array, u: Array | None) -> Array:
+    """Return whether d log |x| / dt may grow without limit at times (K,), from the drift at the far points."""
+    points, n = _far_points(model.n), model.n
+    places = np.broadcast_to(points, (len(times), *points.shape))
+    inputs = None if u is None else np.broadcast_to(u[:, None, None], (*places.shape[:-1], u.shape[-1]))
+    with np.errstate(all="ignore"):
+        drift = _motion(model)(places, np.broadcast_to(times[:, None, None], places.shape[:-1]), theta, inputs)[..., :n]
+        rates = np.einsum("krdi,rdi->krd", drift, points) / FAR[:, None] ** 2
+        rates = np.where(np.isnan(rates), np.inf * np.isinf(drift).any(axis=-1), rates).max(axis=2)
+        return np.asarray((rates.max(axis=1) > FASTER * np.maximum(rates[:, 0], 0.0)) & (rates.max(axis=1) > 1e-6))
 
 
 def _root(cov: Array) -> Array:
