@@ -48,7 +48,7 @@ def test_families_of_each_generation_and_of_the_first_ancestors():
     founders = parents[0][parents[1][parents[2]]] // 2
     founders = founders.astype(np.int32)
     means, between, counts = np.empty((5, 2)), np.empty(2), np.empty((2, 5))
-    lineage(padded, np.array([90, 90, 90, 90, 45]), 99, founders, weights, apart, means, between, counts)
+    lineage(padded, np.array([90, 90, 90, 90, 45]), 99, founders, weights, apart, (means, between, counts))
     labels = [np.arange(90), parents[2], parents[1][parents[2]], parents[0][parents[1][parents[2]]], founders]
     for k, label in enumerate(labels):
         size = 45 if k == 4 else 90

@@ -48,7 +48,7 @@ class Builder:
 
     The errors of the builds of an interval add up: each has a `share` of its tolerance.  So do those of intervals where the data
     leaves them: the `error` of the mean at the start, in deviations, lowers the tolerance.  It is `looser` by a factor where
-    ranks met their limit.  What the last build `missed` is known at its control points.
+    ranks met their limit.  What the last build is wrong by is known at its control points.
     """
 
     prepared: Prepared

@@ -45,8 +45,8 @@ ALONE = 1e-9  # off-diagonal noise in a frame that needs no correction
 class Prediction:
     """A density before an observation, as a function, with points of it.
 
-    `log_mass` is the logarithm of its mass, `defect` the mass that was lost, `slope` (n, n) the linearised motion.  What
-    its builds `missed` counts by factors.
+    `log_mass` is the logarithm of its mass, `defect` the mass that was lost, `slope` (n, n) the linearised motion.  The errors
+    of its builds count by factors.
     """
 
     function: Carried

@@ -131,7 +131,7 @@ def variances(genealogy: Genealogy, now: Weighted) -> Variances:
     sizes = np.array([len(now.weights), *genealogy.sizes[DEPTH - lags :][::-1], genealogy.first])
     count, n = len(sizes), len(now.cov)
     found, first = Variances(np.empty((count, n)), np.empty(n), np.empty((2, count))), genealogy.age - genealogy.born
-    lineage(genealogy.parents, sizes, first, genealogy.founders, now.weights, now.deviations, *found)
+    lineage(genealogy.parents, sizes, first, genealogy.founders, now.weights, now.deviations, tuple(found))
     return found
 
 

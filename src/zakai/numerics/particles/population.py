@@ -92,9 +92,10 @@ def _joined(index: Array, labels: Array, count: int, families: Any) -> int:
     return kept + 1
 
 
-@kernel(types.void(types.UniTuple(I4, DEPTH), I8, types.int64, I4, F1, F2, F2, F1, F2))
-def lineage(parents: Any, sizes: Array, first: int, founders: Array, weights: Array, deviations: Array, means: Array,
-            between: Array, counts: Array) -> None:  # fmt: skip
+@kernel(types.void(types.UniTuple(I4, DEPTH), I8, types.int64, I4, F1, F2, types.Tuple((F2, F1, F2))))
+def lineage(
+    parents: Any, sizes: Array, first: int, founders: Array, weights: Array, deviations: Array, out: tuple[Array, Array, Array]
+) -> None:
     """Write what families of particles tell, by generation, and last for those of the first ancestors.
 
     Systematic resampling keeps the order of the particles, so that the members of a family are neighbours.
@@ -106,10 +107,10 @@ def lineage(parents: Any, sizes: Array, first: int, founders: Array, weights: Ar
         founders: the first ancestors (N,).
         weights: of the particles (N,).
         deviations: of the particles from their mean (n, N).
-        means: receives the variances of the means (lags + 1, n).
-        between: receives the variances (n,) of the states between the families of the oldest generation.
-        counts: receives the sums of the squares of the masses of families and their numbers (2, lags + 1).
+        out: receives the variances of the means (lags + 1, n), the variances (n,) of the states between the families of the
+            oldest generation, and the sums of the squares of the masses of families and their numbers (2, lags + 1).
     """
+    means, between, counts = out
     n, count, last = deviations.shape[0], 0, sizes.size - 1
     labels, member = np.empty(weights.size, np.int32), np.empty(weights.size, np.int32)
     mass, sums = np.empty(weights.size), np.empty((weights.size, n))

@@ -16,7 +16,7 @@ from zakai.numerics.trains.kernels import add_train, draw, values_on_grid
 Array = Any
 # Share of the mass of a Gaussian beyond the radius from which it stands for the train where that is smaller than the Gaussian
 # at the radius.  There a train is below the error that it has relative to its largest value: an observation six deviations away
-# would find nothing but that error, and lose the density.  A bent density, with more mass out there, keeps its own values.
+# would find nothing but that error, and lose the density.  A curved density, with more mass out there, keeps its own values.
 TAIL = 1e-4
 SMALL = 1e-12  # variance of noise along an axis, in variances of the density, that is left out
 
