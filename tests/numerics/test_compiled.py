@@ -63,3 +63,15 @@ def _exponentials(x):
     found = x.copy()
     exponentiate(found)
     return found
+
+
+def test_a_helper_of_a_kernel_with_reordered_sums_has_no_reordered_sums_itself():
+    # Adding and subtracting 3 2^51 rounds to a whole number, unless the compiler may cancel the two.
+    names = {"helper": helper}
+    exec("@helper\ndef rounded(x):\n    return (x + 6755399441055744.0) - 6755399441055744.0", names)
+    exec("def first(x):\n    return rounded(x)", names)
+    exec("def second(x):\n    return rounded(x)", names)
+    first = kernel(float64(float64), reordered=True)(names["first"])
+    second = kernel(float64(float64))(names["second"])
+    assert first(0.3) == 0.0
+    assert second(0.3) == 0.0

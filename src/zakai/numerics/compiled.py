@@ -171,7 +171,8 @@ def helper(function: F) -> F:
         from zakai.numerics.inlined import InlinedCompiler
 
         keys["pipeline_class"] = InlinedCompiler
-    dispatcher = _compiler(**keys)(function)
+    # Without an own value it would take that of the kernel that is compiled first, and hand it on to all others.
+    dispatcher = _compiler(fastmath=False, **keys)(function)
     compiled = dispatcher.compile
 
     def compile_common(arguments: Any) -> Any:
