@@ -15,7 +15,8 @@ from playwright.sync_api import Browser, Page, expect
 import zakai
 from zakai.records import write_truth
 
-PATIENCE = 240_000  # milliseconds: the first run of a machine compiles kernels
+PATIENCE = 120_000  # milliseconds: the first run of a machine compiles kernels
+expect.set_options(timeout=PATIENCE)
 
 
 @pytest.fixture(scope="module")
