@@ -133,7 +133,7 @@ class Feed:
         observed = np.array([seen])
         inputs = None if inputs is None else inputs.part(start, stop)
         schedule = Schedule(np.array([start]), np.array([stop]), observed, np.where(observed, [elapsed], 0.0), inputs)
-        if inputs is not None or setting.method.moved is None:
+        if inputs is not None or setting.method.for_interval is None:
             prepared = setting.method.prepare(setting.model, schedule, setting.theta, **setting.options)
         else:
             length = length_of(start, stop)
@@ -145,7 +145,7 @@ class Feed:
                 prepared = setting.method.prepare(setting.model, schedule, setting.theta, **setting.options)
                 self._first[key] = prepared
             else:
-                prepared = setting.method.moved(known, schedule)
+                prepared = setting.method.for_interval(known, schedule)
         noise = notes_on_noise(setting.model, schedule) if self._noise_varies else ()
         return prepared, (*noise, *prepared.notes)
 

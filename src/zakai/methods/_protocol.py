@@ -218,8 +218,8 @@ class Method(Generic[P, S]):
     of which one has an infinitesimal imaginary part.  It returns the states after each step, their Infos, the derivatives (p,) of
     the sum of what they gained, and the last shifted states; or None, where `step` is to carry them.
 
-    Optional: `moved(prepared, schedule)` returns what `prepare` returns for one interval without inputs, from what is prepared
-    for another one, in which the same coordinates are seen and the same of them are increments over just the interval.
+    Optional: `for_interval(prepared, schedule)` returns what `prepare` returns for one interval without inputs, from what is
+    prepared for another one, in which the same coordinates are seen and the same of them are increments over just the interval.
 
     Optional: `backward` is the backward pass of `zakai.smooth`.
 
@@ -249,6 +249,6 @@ class Method(Generic[P, S]):
     valid: Callable[[P, S], bool] | None = None
     segment: Callable[[P, slice, S, np.ndarray], tuple[Sequence[S], Infos] | None] | None = None
     tangents: Callable[[P, Sequence[P], slice, S, Sequence[S], np.ndarray], Tangents[S] | None] | None = None
-    moved: Callable[[P, Schedule], P] | None = None
+    for_interval: Callable[[P, Schedule], P] | None = None
     backward: Backward[P, S, Any] | None = None
     reduced: Callable[[S], S] | None = None

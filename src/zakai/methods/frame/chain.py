@@ -87,7 +87,7 @@ class Chain:
         steps = motion.steps(self.interval, points, (t0, t1), self.values, 0.1 * self.builder.rule.tolerance)
         path = motion.path(self.interval, t0, t1, self.values, steps)
         ends, logs = motion.ends(points, path)
-        self.missed = [part.moved(motion.ends(part.mass.points, path)[0]) for part in self.missed]
+        self.missed = [part.at(motion.ends(part.mass.points, path)[0]) for part in self.missed]
         finite = (np.abs(ends) < FAR).all(axis=0) & np.isfinite(logs)  # NaN is not below, either
         if not finite.all():
             self.lost = max(self.lost, float(weights[~finite].sum()))

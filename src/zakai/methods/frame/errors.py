@@ -42,7 +42,7 @@ class Missed:
     mass: Mass
     relative: Array
 
-    def moved(self, ends: Array) -> Missed:
+    def at(self, ends: Array) -> Missed:
         """Return the same errors at other points (n, P), of which only finite ones count."""
         finite = np.isfinite(ends).all(axis=0)
         weights = self.mass.weights[finite]
@@ -66,10 +66,10 @@ class Missed:
         if few:
             seen = mass.reweighted(mass.power(logs, FEW) * logs)
         mean, P = seen.moments()
-        moved = seen.weights * (self.relative - self.relative @ seen.weights) * (seen.points - mean[:, None])
+        shares = seen.weights * (self.relative - self.relative @ seen.weights) * (seen.points - mean[:, None])
         if few:
-            moved = ratio(cov, P) @ moved
-        found = ErrorOfMean(moved.sum(axis=1), moved @ moved.T)
+            shares = ratio(cov, P) @ shares
+        found = ErrorOfMean(shares.sum(axis=1), shares @ shares.T)
         size, most = in_deviations(found.square, cov), MOST * float(self.mass.moving @ np.abs(self.relative))
         factor = min(1.0, most / max(size, 1e-300))
         return ErrorOfMean(factor * found.bias, factor**2 * found.spread)

@@ -96,7 +96,7 @@ def in_space(method: Method[Any, Any], prepare: Callable[..., Any]) -> Method[An
 
     return replace(
         method, prepare=prepare, init=space_filter.init, step=space_filter.step, density=space_filter.density,
-        state=space_filter.State, valid=space_filter.valid, segment=None, tangents=None, moved=None, backward=SPACE,
+        state=space_filter.State, valid=space_filter.valid, segment=None, tangents=None, for_interval=None, backward=SPACE,
     )  # fmt: skip
 
 
@@ -120,6 +120,6 @@ METHOD: Method[Any, Any] = Method(
     handles=HANDLES,
     segment=line_filter.segment,
     tangents=line_tangents.tangents,
-    moved=line_filter.moved,
+    for_interval=line_filter.for_interval,
     backward=LINE,
 )

@@ -72,9 +72,9 @@ def prepare(model: Model, schedule: Schedule, theta: np.ndarray, tolerance: floa
     return replace(result, generous=SLOW_GENEROUS) if result.kinked else result
 
 
-def moved(prepared: Prepared, schedule: Schedule) -> Prepared:
+def for_interval(prepared: Prepared, schedule: Schedule) -> Prepared:
     """Return what is prepared for one interval, from that of another one with the same sensors."""
-    return prepared.moved(schedule)
+    return prepared.for_interval(schedule)
 
 
 def step(prepared: Prepared, k: int, state: State, observed: np.ndarray) -> tuple[State, Info]:

@@ -130,7 +130,7 @@ class Prepared:
         vars(result).update({name: known[name] for name in FIELDS}, schedule=schedule, shares=shares, cut_up=cut_up)
         return result
 
-    def moved(self, schedule: Schedule) -> Prepared:
+    def for_interval(self, schedule: Schedule) -> Prepared:
         """Return the same for another interval with the same sensors, where only its length and coefficients in time are new."""
         if not self.timed or self.kernels is not None or self.parts is not None or not self.fast[0]:
             return self.over(schedule)
