@@ -13,7 +13,8 @@ import numpy as np
 from zakai.methods._protocol import Info
 from zakai.methods.frame.chain import Chain, Prediction, corrections, extrapolated
 from zakai.methods.frame.placement import Mass
-from zakai.methods.frame.state import Choice, Control, Half, Made, Prepared, State, Substeps, Unresolved
+from zakai.methods.frame.state import Choice, Control, Half, Made, Prepared, State, Substeps
+from zakai.methods.frame.unresolved import Unresolved
 from zakai.methods.particles.programs import Array
 from zakai.numerics.trains.cross import cross
 from zakai.numerics.trains.train import Train

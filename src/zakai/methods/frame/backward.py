@@ -31,7 +31,8 @@ from zakai.methods.frame.chain import Chain
 from zakai.methods.frame.filter import GAIN, WITHIN, builder_of, direction_of, error_of, predicted
 from zakai.methods.frame.filter import density as filtered_density
 from zakai.methods.frame.moves import Led
-from zakai.methods.frame.state import Prepared, State, Unresolved
+from zakai.methods.frame.state import Prepared, State
+from zakai.methods.frame.unresolved import Unresolved
 from zakai.methods.particles.programs import Array
 from zakai.numerics.particles.random import key_of
 from zakai.numerics.trains.conditional import drawn_before

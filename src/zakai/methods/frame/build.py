@@ -10,7 +10,8 @@ import numpy as np
 
 from zakai.methods.frame.errors import Missed
 from zakai.methods.frame.placement import Mass, Placed, Rule, closed_axes, place, with_spacing
-from zakai.methods.frame.state import Choice, Prepared, Unresolved
+from zakai.methods.frame.state import Choice, Prepared
+from zakai.methods.frame.unresolved import Unresolved
 from zakai.methods.particles.programs import Array
 from zakai.numerics.trains.carried import Carried
 from zakai.numerics.trains.cross import FLOOR, Options, cross

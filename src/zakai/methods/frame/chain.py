@@ -25,7 +25,8 @@ from zakai.methods.frame.build import CLOUD, Builder
 from zakai.methods.frame.errors import Missed
 from zakai.methods.frame.moves import Flow, Kick, Move, Noise
 from zakai.methods.frame.placement import Mass
-from zakai.methods.frame.state import Half, Prepared, Unresolved
+from zakai.methods.frame.state import Half, Prepared
+from zakai.methods.frame.unresolved import Unresolved
 from zakai.methods.frame.weak_points import WeakPoints
 from zakai.methods.particles.interval import Interval
 from zakai.methods.particles.programs import Array

@@ -21,7 +21,8 @@ from zakai.methods.frame.build import CONTROLS, Builder, difference
 from zakai.methods.frame.chain import MOST_SUBSTEPS, Chain, Prediction, extrapolated
 from zakai.methods.frame.errors import carried, in_deviations, total
 from zakai.methods.frame.placement import Mass
-from zakai.methods.frame.state import LONGER, Choice, Control, Made, Prepared, State, Substeps, Unresolved
+from zakai.methods.frame.state import LONGER, Choice, Control, Made, Prepared, State, Substeps
+from zakai.methods.frame.unresolved import Unresolved
 from zakai.methods.frame.update import depth_of, update
 from zakai.methods.particles.programs import Array
 from zakai.methods.system.escape_of_states import RARE, check_escape

@@ -23,10 +23,6 @@ from zakai.records.schedule import Schedule
 LONGER = 2.0
 
 
-class Unresolved(ArithmeticError):
-    """A density that no grid holds: the substep is too long, or the density was lost."""
-
-
 class Substeps(NamedTuple):
     """How intervals are divided, by the last comparison of s and 2 s substeps, in the interval `audited`.
 

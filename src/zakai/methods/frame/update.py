@@ -11,7 +11,8 @@ import numpy as np
 from zakai.methods.frame.build import CLOUD, Builder
 from zakai.methods.frame.chain import Prediction
 from zakai.methods.frame.placement import Mass
-from zakai.methods.frame.state import Choice, Unresolved
+from zakai.methods.frame.state import Choice
+from zakai.methods.frame.unresolved import Unresolved
 from zakai.methods.particles.programs import Array
 from zakai.numerics.trains.carried import Carried, Likelihood
 from zakai.numerics.trains.train import Train
