@@ -75,7 +75,7 @@ def test_a_first_observation_that_takes_long_is_announced(monkeypatch, caplog):
 
 
 def test_slow_steps_are_announced_within_a_segment_and_on_the_way_back(monkeypatch, caplog):
-    for name, value in (("LONG", 0.0), ("EARLY", 0.0), ("FEW", 2), ("WATCHED", 1e6)):
+    for name, value in (("LONG", 0.0), ("EARLY", 0.0), ("FEW", 2), ("WATCHED", 1e6), ("OFF", 1e6)):
         monkeypatch.setattr(batch, name, value)
     model = zakai.load_model("gallery:pendulum")
     _, record = zakai.simulate(model, 0.5 * np.arange(1, 41), seed=0)

@@ -237,6 +237,16 @@ def test_a_slider_keeps_the_record_so_that_two_values_are_compared(page: Page):
     expect(page.get_by_test_id("fact-log-likelihood")).not_to_have_text(re.compile(re.escape(f"{shown[1]}".replace("-", "−"))))
 
 
+def test_a_record_is_filtered_although_it_is_described_twice_at_a_time(page: Page):
+    page.evaluate("""() => {
+        const { data, state } = window.studio;
+        state.data = { ...state.data, until: 30 };
+        data.changed();
+        data.describe.now();
+    }""")
+    expect_status(page, "Filtered 300 ")
+
+
 def test_the_reader_chooses_the_end_of_the_forecast(page: Page):
     page.get_by_test_id("show-forecast").click()
     expect(page.get_by_test_id("forecast-until")).to_have_value("72")

@@ -12,6 +12,7 @@ export class Data {
   constructor(studio) {
     this.studio = studio;
     this.file = null; // what the file that was dropped holds
+    this.wanted = false; // whether the record is to be filtered once it is described
     this.describe = debounced(() => this._describe(), 150);
     this.body = byId("data-body");
     this.facts = h("p", { class: "small", "data-testid": "data-facts" });
@@ -110,7 +111,8 @@ export class Data {
     try {
       const found = await upload(file, LARGEST);
       this.studio.state.data = { ...before, truth: { file: found.file, name: file.name, of: this.studio.model.state.join() } };
-      if (await this._describe()) { this._mapping(); this.studio.remember(); this.studio.run(); } else this.studio.state.data = before;
+      this.wanted = true;
+      if (await this._describe() === false) this.studio.state.data = before; else { this._mapping(); this.studio.remember(); }
     } catch (error) { this.wrong(error.message); }
   }
 
@@ -194,10 +196,19 @@ export class Data {
   /** Another record: describe it and filter it. */
   async changed(run = true) {
     this.studio.remember();
-    if (await this._describe() && run) this.studio.run();
+    this.wanted ||= run;
+    await this._describe();
   }
 
+  /** Say what the record holds, and filter it if that is wanted; null where a newer description does both. */
   async _describe() {
+    const told = await this._told();
+    if (told && this.wanted) this.studio.run();
+    if (told !== null) this.wanted = false;
+    return told;
+  }
+
+  async _told() {
     const { studio } = this, { text, data } = studio.state;
     if (!studio.model || (data.kind === "file" && !data.file)) return false;
     if (data.kind === "file" && data.columns && data.inputs) {
@@ -208,7 +219,7 @@ export class Data {
     try {
       found = await studio.ask("describe", { text, data }, { quiet: true });
     } catch (error) { this.wrong(error.message); return false; }
-    if (!found) return false;
+    if (!found) return null;
     this.fault.hidden = true;
     byId("data-said").classList.remove("fault");
     byId("data-said").textContent = `${found.name}, ${counted(found.rows, "row")}`;
