@@ -127,7 +127,7 @@ class Studio {
     this.editor.value = text;
     this.data.draw();
     this.method.clear();
-    if (await this._read()) await this.run();
+    if (await this.read.now()) await this.run();
   }
 
   /** Take the model of a file of the reader, with the record that is there. */
@@ -158,7 +158,7 @@ class Studio {
     this.state.text = found.text;
     this.editor.value = found.text;
     this.remember();
-    return this._read();
+    return this.read.now();
   }
 
   async _read() {
