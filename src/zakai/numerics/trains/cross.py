@@ -76,7 +76,9 @@ class _Cross:
         return self.function(x).reshape(a, N, b)
 
     def _skeleton(self, A: Array) -> tuple[Array, Array, Array]:
-        """Return rows, C with A ~ C A[rows], and the pivot columns."""
+        """Return rows, C with A ~ C A[rows], and the pivot columns; LinAlgError where A has no finite norm."""
+        if not math.isfinite(np.vdot(A, A)):
+            raise np.linalg.LinAlgError("a function has no finite values on a grid")
         most = min(self.options.most_rank, *A.shape)
         rows, columns, out = np.empty(most, np.int64), np.empty(most, np.int64), np.empty((len(A), most))
         tolerance = self.options.tolerance / math.sqrt(max(self.grid.n - 1, 1))
