@@ -26,7 +26,7 @@ def begun(prepared: Prepared, function: Callable[[Array], Array], choice: Choice
     """Return the prior by a known build."""
     v = _built(prepared, function, choice)
     n = prepared.model.n
-    return State.of(v.scaled(1.0 / v.mass), Control(0, Substeps(1.0, 0.0, 0, False, 0.0), np.zeros((n, n))))
+    return State.of(v.scaled(1.0 / v.mass), Control(0, Substeps(1.0, 0.0), np.zeros((n, n)), np.zeros(n)))
 
 
 def step(chain: Chain, state: State, made: Made, figures: Sequence[str]) -> tuple[State, Info]:
@@ -38,7 +38,7 @@ def step(chain: Chain, state: State, made: Made, figures: Sequence[str]) -> tupl
     if len(predictions) > 1:
         function = extrapolated(*predictions)
     if made.tails:
-        function = function.with_tails()
+        function = function.with_tails(made.tails)
     law = prepared.motion.likelihood(interval, chain.values)
     function = function.times(law._replace(top=made.top)).about(made.choice.turn)
     v = _built(prepared, function, made.choice)

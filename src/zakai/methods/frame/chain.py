@@ -129,7 +129,7 @@ class Chain:
         v, D, total = self._built(function, mass, Q)
         self.halves[-1] = self.halves[-1]._replace(about=(mean, scale), choice=self.builder.choice(v))
         variances, turned = np.maximum(np.diag(D), 0.0), corrections(D)
-        self.moves.append(Noise(v, variances, turned))
+        self.moves.append(Noise(v, variances, turned, self.builder.tails))
         v = v.convolve(variances, ROUNDING * self.builder.options.tolerance)
         v = v.in_basis(np.ascontiguousarray(v.grid.basis @ turned))
         return v.scaled(1.0 / total), *self._of_mass(function, total)

@@ -90,20 +90,18 @@ def ratio(cov: Array, P: Array) -> Array:
     return np.asarray(np.linalg.solve(unit, (cov / scale).T).T / scale)
 
 
-def carried(error: Array, mass: Mass, slope: Array, cov: Array) -> Array:
-    """Return what a motion and an observation leave of an error of the mean, as covariances (n, n).
+def carried(mass: Mass, slope: Array, cov: Array) -> Array:
+    """Return the matrix (n, n) by which a motion and an observation change an error of the mean.
 
     An observation does not change the ratio of a wrong density to the right one.  Where its logarithm is c'x the mean is off by
     P c, before and after with the covariance P of that time.
 
     Args:
-        error: before the motion.
         mass: points of the prediction.
         slope: the linearised motion (n, n).
         cov: the covariance after the observation.
     """
-    left = ratio(cov, mass.moments()[1]) @ slope
-    return np.asarray(left @ error @ left.T)
+    return ratio(cov, mass.moments()[1]) @ slope
 
 
 def in_deviations(error: Array, cov: Array) -> float:

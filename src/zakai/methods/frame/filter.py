@@ -9,7 +9,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -17,27 +17,29 @@ from zakai.densities import TensorTrainDensity
 from zakai.densities._values import wrap
 from zakai.methods._protocol import Info
 from zakai.methods.frame import again
-from zakai.methods.frame.build import CONTROLS, Builder, difference
+from zakai.methods.frame.build import Builder
 from zakai.methods.frame.chain import MOST_SUBSTEPS, Chain, Prediction, extrapolated
-from zakai.methods.frame.errors import carried, in_deviations, total
+from zakai.methods.frame.errors import carried, in_deviations, ratio, total
 from zakai.methods.frame.placement import Mass
-from zakai.methods.frame.state import LONGER, Choice, Control, Made, Prepared, State, Substeps
+from zakai.methods.frame.state import Choice, Control, Made, Prepared, State, Substeps
+from zakai.methods.frame.time_error import measured
 from zakai.methods.frame.unresolved import Unresolved
 from zakai.methods.frame.update import depth_of, update
 from zakai.methods.particles.programs import Array
 from zakai.methods.system.escape_of_states import RARE, check_escape
 from zakai.models.prior import DensityPrior
+from zakai.numerics.trains.carried import Likelihood
 from zakai.numerics.trains.train import Train, quasi_random
 
 PRIOR_POINTS, BLOCK = 1024, 1024
-AUDIT = 10  # intervals between comparisons of s and 2 s substeps, where the last one was within bounds
-# The difference of s and 2 s substeps in L1 is the error of s substeps times 3 / 4: with this share of the tolerance s are taken.
+# The difference of s and 2 s substeps is the error of s substeps times 3 / 4: with this share of the tolerance s are taken.
 # What is extrapolated from both has a third to a twentieth of it.
-TIME_SHARE, GAIN, ACCEPTED, SAFETY = 1.0, 4.0, 8.0, 0.7
+TIME_SHARE, GAIN, SAFETY = 1.0, 4.0, 0.7
 IN_TAILS = 0.03  # error of a mean over tolerance e^depth: linear tracks with observations 4 and 6 deviations away
 BEYOND = 0.3  # error of a mean over the distance of an observation, where a Gaussian stands for the tails
 OF_MEAN = 0.6  # error of a mean over what a motion loses of the mass, what is near an edge, and the error of time in L1
 OF_TAILS = 0.25  # growth of the logarithm of a relative error with the depth, on wide tracks seen by bearings
+DEEP, SHARPEST = 2.0, 0.03  # depth in nats from which a prediction has a smaller tolerance, and the least factor of it
 WITHIN = 3.0  # tolerances that the error of a mean may reach
 FIGURES = (
     "error_estimate", "tolerance_ratio", "rank", "mass_defect", "off_grid_error", "edge_mass", "tail_depth", "powers",
@@ -66,7 +68,7 @@ def init(prepared: Prepared, prior: Any) -> State:
     assert model.n == len(mass.points) and len(theta) == len(prepared.theta)
     _, P = mass.unwrapped(system.base.angles).moments()
     error = builder.missed.of_mean(np.zeros(len(builder.missed.relative)), P, system.base.angles)
-    control = Control(0, Substeps(1.0, 0.0, -AUDIT, False, 0.0), error.square)
+    control = Control(0, Substeps(1.0, 0.0), error.square, np.zeros(model.n))
     return State.of(v.scaled(1.0 / v.mass), control)
 
 
@@ -189,8 +191,8 @@ def _step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[tupl
         return again.step(Chain(prepared, interval, values, Builder(prepared)), state, known, FIGURES), 0.0
     builder = builder_of(prepared, state)
     chain = Chain(prepared, interval, values, builder)
-    prediction, count, time, in_time = predicted(chain, state)
     likelihood = prepared.motion.likelihood(interval, values)
+    prediction, count, time, in_time, shift, seen = predicted(chain, state, likelihood)
     updated = update(builder, prediction, likelihood)
     v, rule = updated.density, builder.rule
     if choices is not None and updated.choice is not None:
@@ -211,9 +213,11 @@ def _step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[tupl
     parts.append((1.0, builder.missed.of_mean(np.zeros(len(builder.missed.relative)), cov, angles)))
     # Where an observation leads into the tails, the relative errors of earlier builds are larger.
     larger = math.exp(2.0 * OF_TAILS * min(max(depth, 0.0), 50.0))
-    before = carried(control.error, prediction.mass.unwrapped(angles), prediction.slope, cov)
-    errors = larger * before + new**2 * cov + total(parts, len(mean)).square
-    error = in_deviations(errors, cov)
+    left = carried(prediction.mass.unwrapped(angles), prediction.slope, cov)
+    errors = larger * (left @ control.error @ left.T) + new**2 * cov + total(parts, len(mean)).square
+    # Errors of time have the same sign in many intervals.
+    bias = math.sqrt(larger) * left @ control.bias + ratio(cov, seen) @ shift
+    error = in_deviations(errors + np.outer(bias, bias), cov)
     health = {
         "error_estimate": error,
         "tolerance_ratio": error / (WITHIN * prepared.tolerance),
@@ -228,13 +232,14 @@ def _step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[tupl
         "effective_share": updated.effective,
     }
     lost = max(chain.lost, prediction.defect)
-    after = Control(control.interval + 1, time, errors, builder.after())
+    after = Control(control.interval + 1, time, errors, bias, builder.after())
     return (State.of(v, after), Info(updated.log_evidence, mean, cov, health)), lost
 
 
 def error_of(prepared: Prepared, state: State) -> float:
     """Return the estimated error of the mean of a state, in standard deviations."""
-    return in_deviations(state.control.error, state.train(prepared.system.periods).moments()[1])
+    control = state.control
+    return in_deviations(control.error + np.outer(control.bias, control.bias), state.train(prepared.system.periods).moments()[1])
 
 
 def builder_of(prepared: Prepared, state: State) -> Builder:
@@ -242,42 +247,70 @@ def builder_of(prepared: Prepared, state: State) -> Builder:
     return Builder(prepared, error_of(prepared, state), state.control.looser)
 
 
-def predicted(chain: Chain, state: State) -> tuple[Prediction, int, Substeps, float]:
-    """Return the prediction over an interval, the number of its substeps, how the next are divided, and the error in time."""
-    prepared, interval, time = chain.prepared, chain.interval, state.control.time
-    length, number = interval.stop - interval.start, state.control.interval + 1
-    count = min(max(1, math.ceil(time.needed(length) - 1e-9)), MOST_SUBSTEPS)
-    u = state.train(prepared.system.periods)
-    prediction, count = chain.first(u, count)
-    exact = prepared.system.base.affine and prepared.system.base.sampled and not prepared.system.base.driven
-    if length > 0 and not exact and (time.both or length > LONGER * time.length or number - time.audited >= AUDIT):
-        return _audited(chain, u, prediction, count, number)
-    return prediction, count, time, time.left(length, count)
+class Predicted(NamedTuple):
+    """A prediction, the number of its substeps, how the next are divided, the error of time, and that of the mean (n,).
+
+    The last is that of a density with a covariance (n, n).
+    """
+
+    prediction: Prediction
+    substeps: int
+    time: Substeps
+    error: float
+    shift: Array
+    cov: Array
 
 
-def _audited(
-    chain: Chain, u: Train, coarser: Prediction, count: int, number: int
-) -> tuple[Prediction, int, Substeps, float]:
-    """Return the prediction extrapolated from s and 2 s substeps, 2 s, what their difference says of the next, and its error."""
-    allowed, length = TIME_SHARE * chain.builder.allowed, chain.interval.stop - chain.interval.start
-    while True:
-        finer, more = chain.first(u, 2 * count)
-        control = finer.mass.control(CONTROLS, chain.prepared.tolerance)
-        error = difference(coarser.function.scaled(coarser.log_scale - finer.log_scale), finer.function, control)
-        # What the builds of both differ by is not an error of time.
-        error = max(error - sum(report.off_grid for report in chain.builder.reports), 0.3 * error)
-        if error < ACCEPTED * allowed or 2 * more > MOST_SUBSTEPS:
+def predicted(chain: Chain, state: State, likelihood: Likelihood) -> Predicted:
+    """Return the prediction over an interval; that of a smaller tolerance where a likelihood leads into its tails."""
+    found, builder = _predicted(chain, state, likelihood), chain.builder
+    mass = found.prediction.mass.unwrapped(chain.prepared.system.base.angles)
+    depth = mass.depth(chain.prepared.motion.logs(likelihood, mass.points))
+    if DEEP < depth < math.log(1.0 / builder.rule.tolerance):
+        builder.reports.clear()
+        builder.sharper = max(math.exp(-depth), SHARPEST)
+        found = _predicted(chain, state, likelihood)
+        builder.sharper = 1.0
+    return found
+
+
+def _predicted(chain: Chain, state: State, likelihood: Likelihood) -> Predicted:
+    """Return the prediction over an interval, whose substeps meet the tolerance where a likelihood leads."""
+    base, interval, time = chain.prepared.system.base, chain.interval, state.control.time
+    u, length = state.train(chain.prepared.system.periods), interval.stop - interval.start
+    nothing = np.zeros(u.grid.n), np.eye(u.grid.n)
+    if length <= 0 or (base.affine and base.sampled and not base.driven):
+        prediction, count = chain.first(u, 1)
+        return Predicted(prediction, count, time, 0.0, *nothing)
+    allowed = SAFETY * TIME_SHARE * chain.builder.allowed
+    guess = length * time.substeps / time.length if time.length > 0 else 1.0
+    count = min(max(1, math.ceil(guess - 1e-9)), MOST_SUBSTEPS)
+    for _ in range(4):
+        found = measured(chain, u, count, likelihood)
+        error = math.inf if found is None else found.size
+        # s substeps have an error of second order, what is extrapolated one of fourth; three times as many are needed for it.
+        change = min(error / allowed, MOST_SUBSTEPS**2)
+        plain, both = count * math.sqrt(change), count * (0.75 / GAIN * change) ** 0.25
+        extrapolate = plain > 3.0 * max(both, 1.0)
+        wanted = min(max(1, math.ceil((both if extrapolate else plain) - 1e-9)), MOST_SUBSTEPS)
+        if count <= 2 * wanted <= 4 * count:
             break
-        coarser, count = finer, more
-    # s substeps have an error of second order, what is extrapolated one of fourth; three times as many are needed for it.
-    plain = 0.5 * more * max(0.5, math.sqrt(error / (SAFETY * allowed)))
-    both = 0.5 * more * max(0.5, (error / (GAIN * SAFETY * allowed)) ** 0.25)
-    extrapolate = plain > 3.0 * both
-    left = 4.0 / 3.0 * error * (0.5 * more / plain) ** 2
-    found = Substeps(both if extrapolate else plain, length, number, extrapolate, left)
-    extra = extrapolated(finer, coarser)
-    motions = (*finer.motions, *coarser.motions)
+        count = wanted
+    prediction, count = chain.first(u, wanted)
+    time = Substeps(both if extrapolate else plain, length)
+    gain = 1.0
+    if extrapolate:
+        prediction, gain = _extrapolated(chain, u, prediction, count), 0.75 / GAIN
+    if found is None:
+        return Predicted(prediction, count, time, math.inf, *nothing)
+    gain *= (found.substeps / count) ** 2
+    return Predicted(prediction, count, time, gain * error, gain * found.shift, found.cov)
+
+
+def _extrapolated(chain: Chain, u: Train, coarser: Prediction, count: int) -> Prediction:
+    """Return the prediction extrapolated from s and 2 s substeps."""
+    finer, _ = chain.first(u, 2 * count)
     missed = [(4.0 / 3.0 * factor, part) for factor, part in finer.missed]
     missed += [(-1.0 / 3.0 * factor, part) for factor, part in coarser.missed]
-    answer = Prediction(extra, finer.mass, finer.log_mass, finer.defect, finer.slope, motions, tuple(missed))
-    return answer, more, found, error / GAIN
+    function, motions = extrapolated(finer, coarser), (*finer.motions, *coarser.motions)
+    return Prediction(function, finer.mass, finer.log_mass, finer.defect, finer.slope, motions, tuple(missed))

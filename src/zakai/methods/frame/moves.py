@@ -62,11 +62,15 @@ class Flow:
 
 @dataclass(frozen=True)
 class Noise:
-    """Noise with the variances (n,) along the axes of a density, and the linear map (n, n) of its coordinates after it."""
+    """Noise with the variances (n,) along the axes of a density, and the linear map (n, n) of its coordinates after it.
+
+    A Gaussian stands for its `tails`, as in `Train`.
+    """
 
     density: Train
     variances: Array
     turned: Array
+    tails: float
 
     def before(self, x: Array, rng: np.random.Generator) -> Led:
         """Return states before the noise; far out, where a train is not accurate, those of the Gaussian that stands for it."""
@@ -82,7 +86,7 @@ class Noise:
         away, total = y - mean[:, None], P + np.diag(self.variances)
         far = np.zeros(count, bool)
         if not grid.closed.any():
-            far = (away * np.linalg.solve(total, away)).sum(axis=0) > tail_radius(n)
+            far = (away * np.linalg.solve(total, away)).sum(axis=0) > tail_radius(n, self.tails)
         gaussian = far | unknown
         normal = rng.standard_normal((n, count))
         if gaussian.any():

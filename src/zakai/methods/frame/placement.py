@@ -84,6 +84,13 @@ class Mass:
         """The effective number of points."""
         return float(1.0 / np.sum(self.weights**2))
 
+    def depth(self, logs: Array) -> float:
+        """Return how far into the tails of a Gaussian with these moments a likelihood leads, in nats; zero for equal moments."""
+        if not np.isfinite(logs).any():
+            return math.inf
+        seen = self.reweighted(np.maximum(logs, np.max(logs) - 1e6))
+        return 0.5 * len(self.points) * (float(self.distances**2 @ seen.weights) - 1.0)
+
     def heavy(self, tolerance: float) -> Array:
         """Return which points (P,) cannot be left out: the others have together a small share of the mass."""
         order = np.argsort(self.weights, kind="stable")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
@@ -18,43 +17,25 @@ from zakai.numerics.trains.grid import Grid
 from zakai.numerics.trains.train import Train
 from zakai.records.schedule import Schedule
 
-# Ratio of an interval's length to that of the last comparison of s and 2 s substeps, from which another one is made: in a long
-# interval a density is wider, and its substeps have other errors than in a short one.
-LONGER = 2.0
-
 
 class Substeps(NamedTuple):
-    """How intervals are divided, by the last comparison of s and 2 s substeps, in the interval `audited`.
-
-    So many `substeps` leave the `error` in L1 in an interval of that `length`; with `both`, s and 2 s are always extrapolated.
-    """
+    """How many `substeps` the last interval of a `length` above zero needed."""
 
     substeps: float
     length: float
-    audited: int
-    both: bool
-    error: float
-
-    def needed(self, length: float) -> float:
-        """Return how many substeps an interval needs; substeps of length d have an error in proportion to `length` d^2."""
-        ratio = length / self.length if self.length > 0 else 0.0
-        return self.substeps * ratio * math.sqrt(min(max(ratio, 1.0), LONGER))
-
-    def left(self, length: float, count: int) -> float:
-        """Return the error that so many substeps leave in an interval."""
-        return self.error * (length / self.length) ** 3 * (self.substeps / count) ** 2 if self.length > 0 else 0.0
 
 
 class Control(NamedTuple):
     """What decides the next step beside the density.
 
-    The number of intervals, the substeps, the estimated error of the mean, as a covariance (n, n), and the factor of the
-    tolerance where ranks met their limit.
+    The number of intervals, the substeps, the estimated error of the mean, as a covariance (n, n), that of the time steps, with
+    its sign (n,), and the factor of the tolerance where ranks met their limit.
     """
 
     interval: int
     time: Substeps
     error: Array
+    bias: Array
     looser: float = 1.0
 
 
@@ -107,7 +88,7 @@ class Made(NamedTuple):
     """The choices of an interval: the halves of each prediction that was used, and the build after the observation."""
 
     motions: tuple[tuple[Half, ...], ...]
-    tails: bool
+    tails: float
     top: float
     choice: Choice
 

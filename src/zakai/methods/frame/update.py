@@ -22,6 +22,7 @@ MOST_POWERS = 24  # an observation sixty deviations away needs fifteen
 DEPTH_POINTS = 128
 ROUGHLY = 0.01  # relative error that densities between powers of a likelihood need: they only show where the mass is
 OFF_CENTRE, NARROW, WIDE = 0.5, 0.6, 1.6  # shift and deviation of a density in its frame, from which it gets another frame
+LOST = 3.0  # shift in that other frame, from which the density is in a corner of its box
 
 
 class Updated(NamedTuple):
@@ -55,7 +56,7 @@ def update(builder: Builder, prediction: Prediction, likelihood: Likelihood) -> 
     done, powers = 0.0, 0
     if mass.reweighted(_finite(logs)).effective < FEW:
         # The likelihood is sharp or distant: it may need the tails.
-        prediction = replace(prediction, function=prediction.function.with_tails())
+        prediction = replace(prediction, function=prediction.function.with_tails(builder.tails))
     loose = max(1.0, ROUGHLY / builder.rule.tolerance)
     while mass.reweighted((1.0 - done) * _finite(logs)).effective < FEW and powers < MOST_POWERS:
         power = min(done + (1.0 - done) * mass.power((1.0 - done) * _finite(logs), 1.5 * FEW), 1.0)
@@ -68,6 +69,8 @@ def update(builder: Builder, prediction: Prediction, likelihood: Likelihood) -> 
     v, top = _product(builder, prediction, mass, likelihood, 1.0, 1.0)
     if _off_centre(v):
         v, top = _product(builder, prediction, Mass(*v.cloud(CLOUD)), likelihood, 1.0, 1.0)
+        if not np.abs(_in_frame(v)[0]).max() < LOST:
+            raise Unresolved("the density after the observation is at the edge of its grid")
     return _normalised(builder, v, prediction, top, effective, powers)
 
 
@@ -99,12 +102,17 @@ def _normalised(
 
 def _off_centre(v: Train) -> bool:
     """Return whether the moments of a density are far from those of its frame."""
+    shift, scale = _in_frame(v)
+    return bool(((np.abs(shift) > OFF_CENTRE) | (scale < NARROW) | (scale > WIDE)).any())
+
+
+def _in_frame(v: Train) -> tuple[Array, Array]:
+    """Return the means and the deviations of a density along the axes of its frame; zero and one on closed axes."""
     grid = v.grid
     mean, P = v.moments()
-    free = ~grid.closed
     shift = np.linalg.solve(grid.basis, mean - grid.centre)
     scale = np.sqrt(np.maximum(np.diag(np.linalg.solve(grid.basis, np.linalg.solve(grid.basis, P).T)), 0.0))
-    return bool((free & ((np.abs(shift) > OFF_CENTRE) | (scale < NARROW) | (scale > WIDE))).any())
+    return np.where(grid.closed, 0.0, shift), np.where(grid.closed, 1.0, scale)
 
 
 def depth_of(u: Carried, mass: Mass, posterior: Train, tolerance: float) -> float:

@@ -397,24 +397,54 @@ def _time_errors(
     By the number of stages: the largest error of a mean or a deviation, in standard deviations, the shift of the mean (n,),
     and the error with that of the pilots.
     """
+    system, found = motion.system, coupled(motion, interval, values, pilots, count)
+
+    def change(stages: int) -> tuple[float, Array, float]:
+        x, gained = found.by(motion, stages)
+        shift, largest = np.empty(system.n), np.empty(2)
+        errors = StepErrors(found.start, x, gained, found.finer, found.finer_gained, system.angles, pilots.scale)
+        step_errors(errors, LEAST_CONTRACTION, shift, largest)
+        return 4 / 3 * float(largest[0]), 4 / 3 * shift, 4 / 3 * float(largest[1])
+
+    return {2: change(2), 4: change(4)}
+
+
+class Coupled(NamedTuple):
+    """Pilots that twice as many substeps moved from `start` to `finer` (n, N), and the `coarse` events with the same `noise`."""
+
+    start: Array
+    finer: Array
+    finer_gained: Array
+    coarse: Events
+    noise: Array
+
+    def by(self, motion: Motion, stages: int) -> tuple[Array, Array]:
+        """Return the ends (n, N) by the coarse events in so many stages, and the integrated log weights (N,)."""
+        places = self.coarse.places.copy()
+        places[:, 2] = stages
+        return motion.advanced(self.coarse._replace(places=places), self.start, self.noise)
+
+
+def coupled(
+    motion: Motion, interval: Interval, values: Array, pilots: Pilots, count: int, paired: bool = False
+) -> Coupled:
+    """Return pilots after an interval by 2 `count` substeps, and what moves them by `count` with the same noise.
+
+    Where they are `paired`, the four quarters have equal starts, the noise of both signs, and that of both halves of each
+    substep in both orders.
+    """
     system, mean, scale = motion.system, pilots.mean, pilots.scale
     (coarse, slopes), (fine, _) = (motion.linearised(interval, Scheme(k, 4), values, mean, scale) for k in (count, 2 * count))
     noise, start = np.empty((fine.width, pilots.states.shape[1])), pilots.states
     normals(key_of(pilots.key), 0, noise.shape[1], noise)
-    if system.kind != ADDITIVE:
+    if paired:
+        quarter = noise.shape[1] // 4
+        noise[:, quarter : 2 * quarter] = -noise[:, :quarter]
+    if paired or system.kind != ADDITIVE:
         noise, start = _exchanged(fine, noise, start)
     shared = _coarse_noise(motion, coarse, fine, noise, 0.25 * (interval.stop - interval.start) / count * slopes)
-    y, finer = motion.advanced(fine, start, noise)
-
-    def change(stages: int) -> tuple[float, Array, float]:
-        places = coarse.places.copy()
-        places[:, 2] = stages
-        x, gained = motion.advanced(coarse._replace(places=places), start, shared)
-        shift, largest = np.empty(system.n), np.empty(2)
-        step_errors(StepErrors(start, x, gained, y, finer, system.angles, scale), LEAST_CONTRACTION, shift, largest)
-        return 4 / 3 * float(largest[0]), 4 / 3 * shift, 4 / 3 * float(largest[1])
-
-    return {2: change(2), 4: change(4)}
+    y, gained = motion.advanced(fine, start, noise)
+    return Coupled(start, y, gained, coarse, shared)
 
 
 def _exchanged(fine: Events, noise: Array, start: Array) -> tuple[Array, Array]:

@@ -72,9 +72,9 @@ class Carried:
         """Return the same density times another likelihood."""
         return replace(self, likelihood=likelihood)
 
-    def with_tails(self) -> Carried:
-        """Return the same density with Gaussian tails."""
-        terms = (term._replace(density=replace(term.density, tails=True)) for term in self.terms)
+    def with_tails(self, share: float) -> Carried:
+        """Return the same density with Gaussian tails, of a share of the mass: see `Train`."""
+        terms = (term._replace(density=replace(term.density, tails=share)) for term in self.terms)
         return replace(self, terms=tuple(terms))
 
     def about(self, turn: Array) -> Carried:

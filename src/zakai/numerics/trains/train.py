@@ -14,19 +14,15 @@ from zakai.numerics.trains.grid import Grid, after_noise, kernel_matrix, padded_
 from zakai.numerics.trains.kernels import add_train, draw, values_on_grid
 
 Array = Any
-# Share of the mass of a Gaussian beyond the radius from which it stands for the train where that is smaller than the Gaussian
-# at the radius.  There a train is below the error that it has relative to its largest value: an observation six deviations away
-# would find nothing but that error, and lose the density.  A curved density, with more mass out there, keeps its own values.
-TAIL = 1e-4
 SMALL = 1e-12  # variance of noise along an axis, in variances of the density, that is left out
 
 
-@lru_cache(maxsize=8)
-def tail_radius(n: int) -> float:
-    """Return the square of the radius beyond which a Gaussian of n states has the share `TAIL` of its mass."""
+@lru_cache(maxsize=64)
+def tail_radius(n: int, share: float) -> float:
+    """Return the square of the radius beyond which a Gaussian of n states has a share of its mass."""
     from scipy.stats import chi2
 
-    return float(chi2.isf(TAIL, n))
+    return float(chi2.isf(share, n))
 
 
 @lru_cache(maxsize=8)
@@ -41,13 +37,16 @@ def quasi_random(count: int, n: int) -> Array:
 class Train:
     """A function on a `grid` by its `cores` (a, N, b); `periods` (n,) are 2 pi for angles and 0 for other states.
 
-    With `tails` a Gaussian stands for it where it is below its accuracy: see `TAIL`.
+    With `tails`, a share of the mass, a Gaussian with the moments of the train stands for it beyond the radius that leaves this
+    share of the Gaussian, where the train is smaller than the Gaussian at the radius.  There a train is below the error that it
+    has relative to its largest value: an observation six deviations away would find nothing but that error, and lose the density.
+    A curved density, with more mass out there, keeps its own values.
     """
 
     grid: Grid
     cores: tuple[Array, ...]
     periods: Array
-    tails: bool = False
+    tails: float = 0.0
 
     @property
     def ranks(self) -> list[int]:
@@ -73,7 +72,7 @@ class Train:
 
     @cached_property
     def _tail(self) -> tuple[Array, Array, Array]:
-        """The Gaussian with the moments of the train that stands for it where it is below its accuracy: see `TAIL`."""
+        """The Gaussian with the moments of the train that stands for it where it is below its accuracy."""
         n, mass = self.grid.n, self.mass
         none = np.zeros(n), np.zeros((n, n)), np.array([np.inf, 0.0, 1.0])
         if not self.tails or self.grid.closed.any() or not mass > 0:
@@ -84,8 +83,9 @@ class Train:
         except np.linalg.LinAlgError:
             return none
         top = mass * float(np.prod(np.diag(whitening))) / (2.0 * math.pi) ** (0.5 * n)
-        least = top * math.exp(-0.5 * tail_radius(n))
-        return mean - self.grid.centre, np.ascontiguousarray(whitening), np.array([tail_radius(n), top, least])
+        radius = tail_radius(n, self.tails)
+        least = top * math.exp(-0.5 * radius)
+        return mean - self.grid.centre, np.ascontiguousarray(whitening), np.array([radius, top, least])
 
     @cached_property
     def _packed(self) -> tuple[Any, ...]:
