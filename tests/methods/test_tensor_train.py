@@ -285,6 +285,39 @@ def test_the_estimate_holds_for_a_distance_that_bearings_hardly_show():
     assert (error <= 3 * result.error_estimate[1:]).all()
 
 
+def errors_over_estimates(model, record, **options):
+    """Return the largest error of a mean, in deviations, over three times its estimate: against a grid of all points."""
+    exact = zakai.filter(model, record, "yau-yau", tolerance=1e-6, keep="moments")
+    result = zakai.filter(model, record, "tensor-train", keep="moments", **options)
+    apart = result.mean - exact.mean
+    apart = np.where([name in model.periodic for name in model.state], (apart + np.pi) % (2 * np.pi) - np.pi, apart)
+    error = np.abs(apart / np.sqrt(exact.variance)).max(axis=1)
+    assert not result.warnings
+    return (error[1:] / (3 * result.error_estimate[1:])).max()
+
+
+def test_the_estimate_holds_where_the_time_step_makes_the_error():
+    model = zakai.Model(
+        state=["x", "y"], drift=["-0.857*x - 1.808*tanh(x - 0.821*y)", "-0.724*y - 0.161*tanh(1.109*x)"],
+        diffusion=[[0.321, 0], [0, 0.712]], observation=["x"], observation_kind="samples", observation_noise=[[0.0452]],
+        prior={"kind": "gaussian", "mean": [-0.435, -0.455], "cov": [[0.0652, 0.0118], [0.0118, 0.0436]]},
+    )  # fmt: skip
+    times = [0.066, 0.279, 0.326, 0.684, 0.756, 1.007, 1.2, 2.777, 2.921, 3.057, 3.141, 3.509]
+    seen = [np.nan, -0.105, np.nan, -0.657, -0.282, -0.426, -0.659, -0.125, 0.444, 0.197, 0.467, -0.011]
+    assert errors_over_estimates(model, zakai.Record(times, np.array(seen)[:, None], "samples")) < 1
+
+
+def test_the_estimate_holds_for_an_observation_in_the_tails_of_a_density_with_noise_that_depends_on_the_state():
+    model = zakai.Model(
+        state=["x", "y"], drift=["0.634*y", "-0.281*y - 1.19*sin(x)"], diffusion=[["0.04225*sin(y) + 0.169", 0], [0, 0.562]],
+        observation=["y/2 + sin(x)", "cos(x)"], observation_kind="samples", observation_noise=[[0.205, 0], [0, 0.764]],
+        prior={"kind": "gaussian", "mean": [0.456, 0.403], "cov": [[0.0504, -0.0104], [-0.0104, 0.17]]}, periodic=["x"],
+    )  # fmt: skip
+    values = [[0.346, 1.81], [1.068, -0.675], [0.728, -0.791], [np.nan, np.nan], [0.032, 1.452], [2.752, 0.408]]
+    record = zakai.Record([0.152, 0.293, 0.485, 0.643, 1.132, 1.744], values, "samples")
+    assert errors_over_estimates(model, record) < 1
+
+
 def test_a_mode_of_little_mass_a_turn_away_is_kept():
     pendulum = zakai.Model(
         state=["x", "v"], drift=["v", "-2*sin(x) - 0.2*v"], diffusion=[["0"], ["0.5"]],
