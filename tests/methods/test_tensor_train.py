@@ -333,13 +333,14 @@ def test_a_mode_of_little_mass_a_turn_away_is_kept():
     assert np.abs(found.variance / exact.variance - 1).max() < 0.15  # .84
 
 
-def test_a_wide_angle_with_noise_correlated_with_another_state_is_not_answered_wrongly():
+def test_a_wide_angle_has_noise_in_common_with_another_state():
     model = zakai.Model(
         state=["x", "y"], drift=["0.627*y", "-0.179*y - 0.689*sin(x)"], diffusion=[[0.511, 0], [0.489, 0.36]],
         observation=["sin(x)", "y"], observation_kind="increments", observation_noise=[[0.0874, 0], [0, 0.0539]], periodic=["x"],
         prior={"kind": "gaussian", "mean": [0, 0], "cov": [[0.029, -0.039], [-0.039, 0.173]]},
     )  # fmt: skip
     record = zakai.Record([0.8, 0.9, 1.9, 2.1], [[0.26, -0.29], [0.03, -0.01], [-0.48, -0.56], [0.01, -0.2]], "increments")
-    exact, result = zakai.filter(model, record, "yau-yau"), zakai.filter(model, record, "tensor-train")
-    error = np.abs(result.mean - exact.mean) / np.sqrt(exact.variance)
-    assert np.isnan(error[-1]).all() or error.max() < 1e-2
+    exact, result = (zakai.filter(model, record, method, keep="moments") for method in ("yau-yau", "tensor-train"))
+    assert (np.abs(result.mean - exact.mean) / np.sqrt(exact.variance)).max() < 3e-3
+    assert np.abs(np.sqrt(result.variance / exact.variance) - 1).max() < 3e-3
+    assert abs(result.log_likelihood - exact.log_likelihood) < 3e-3

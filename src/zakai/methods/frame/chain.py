@@ -17,17 +17,17 @@ convolution with a diagonal noise, moments and marginals, weighted points of its
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from zakai.methods.frame.build import CLOUD, Builder
 from zakai.methods.frame.errors import Missed
-from zakai.methods.frame.moves import Flow, Kick, Move, Noise
-from zakai.methods.frame.placement import Mass
+from zakai.methods.frame.moves import Flow, Kick, Move, Noise, Shift
+from zakai.methods.frame.placement import Mass, closed_axes
 from zakai.methods.frame.state import Half, Prepared
 from zakai.methods.frame.unresolved import Unresolved
-from zakai.methods.frame.weak_points import WeakPoints
+from zakai.methods.frame.weak_points import WeakPoints, along_closed_axes, shifted
 from zakai.methods.particles.interval import Interval
 from zakai.methods.particles.programs import Array
 from zakai.numerics.trains.carried import Carried, Likelihood, Term
@@ -126,13 +126,33 @@ class Chain:
         mean, P = mass.moments()
         scale = np.maximum(np.sqrt(np.diag(P)), 1e-12)
         Q = prepared.motion.noise(self.interval, self.values, t1, length, (mean, scale))
+        closed = closed_axes(mass, prepared.system.base.angles, self.builder.rule)
+        directions, Q = along_closed_axes(Q, closed)
         v, D, total = self._built(function, mass, Q)
         self.halves[-1] = self.halves[-1]._replace(about=(mean, scale), choice=self.builder.choice(v))
         variances, turned = np.maximum(np.diag(D), 0.0), corrections(D)
         self.moves.append(Noise(v, variances, turned, self.builder.tails))
         v = v.convolve(variances, ROUNDING * self.builder.options.tolerance)
         v = v.in_basis(np.ascontiguousarray(v.grid.basis @ turned))
-        return v.scaled(1.0 / total), *self._of_mass(function, total)
+        log_mass, defect = self._of_mass(function, total)
+        v = v.scaled(1.0 / total)
+        for direction in directions:
+            here, mass = self._standing(v, t1)
+            spread, mass, shifts = shifted(here, mass, direction, self.builder.rule.width, t1)
+            self.moves.append(Shift(spread, shifts))
+            v, _, total = self._built(spread, mass, None)
+            gained, lost = self._of_mass(spread, total)
+            log_mass, defect, v = log_mass + gained, defect + lost, v.scaled(1.0 / total)
+        return v, log_mass, defect
+
+    def _standing(self, v: Train, t: float) -> tuple[Carried, Mass]:
+        """Return a density as a function that no flow has moved, and points of it."""
+        motion = self.prepared.motion
+        nowhere = motion.path(self.interval, t, t, self.values, 1)
+        nothing = Likelihood(motion.coefficients.law, np.zeros(0), np.zeros(0), t, 1.0, 0.0)
+        term = Term(v, np.array([1.0, 0.0]), motion.backward, nowhere)
+        mass = Mass(*v.cloud(CLOUD)).unwrapped(self.prepared.system.base.angles)
+        return Carried((term,), motion.box, np.full(v.grid.n, np.nan), nothing), mass
 
     def _of_mass(self, function: Carried, total: float) -> tuple[float, float]:
         """Return the logarithm of the mass that a motion leaves, and the defect where it should be one."""
@@ -172,9 +192,7 @@ class Chain:
             gained, lost = self._of_mass(function, total)
             log_mass, defect = log_mass + gained, defect + lost
             v = v.scaled(1.0 / total)
-            nowhere = motion.path(self.interval, t, t, self.values, 1)
-            function = replace(function, terms=(Term(v, np.array([1.0, 0.0]), motion.backward, nowhere),))
-            mass = Mass(*v.cloud(CLOUD))
+            function, mass = self._standing(v, t)
         return v, log_mass, defect
 
     def predict(self, u: Train, count: int) -> Prediction:

@@ -20,6 +20,7 @@ from zakai.methods.frame import again
 from zakai.methods.frame.build import Builder
 from zakai.methods.frame.chain import MOST_SUBSTEPS, Chain, Prediction, extrapolated
 from zakai.methods.frame.errors import carried, in_deviations, ratio, total
+from zakai.methods.frame.moves import Shift
 from zakai.methods.frame.placement import Mass
 from zakai.methods.frame.state import Choice, Control, Made, Prepared, State, Substeps
 from zakai.methods.frame.time_error import measured
@@ -195,7 +196,7 @@ def _step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[tupl
     prediction, count, time, in_time, shift, seen = predicted(chain, state, likelihood)
     updated = update(builder, prediction, likelihood)
     v, rule = updated.density, builder.rule
-    if choices is not None and updated.choice is not None:
+    if choices is not None and updated.choice is not None and not any(isinstance(move, Shift) for move in chain.moves):
         tails = updated.prediction.terms[0].density.tails
         choices.made[key] = Made(prediction.motions, tails, updated.top, updated.choice)
     mean, cov = v.moments(direction_of(prepared, v))

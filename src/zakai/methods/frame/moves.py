@@ -108,16 +108,32 @@ class Kick:
 
     def before(self, x: Array, rng: np.random.Generator) -> Led:
         """Return states before the noise."""
-        values = np.array([np.maximum(replace(self.function, terms=(term,))(x), 0.0) for term in self.function.terms])
-        sums = np.cumsum(values, axis=0)
-        unknown = ~(sums[-1] > 0)
-        chosen = np.minimum((sums < rng.random(x.shape[1]) * sums[-1]).sum(axis=0), len(values) - 1)
-        chosen[unknown] = len(values) // 2
-        found, means = np.empty_like(x), np.zeros_like(x)
-        for number, path in enumerate(self.paths):
-            own, used = chosen == number, values[number] > 0
-            ends, _ = self.motion.ends(x, path)
-            found[:, own] = ends[:, own]
-            means[:, used] += (values[number] / np.maximum(sums[-1], 1e-300) * ends)[:, used]
-        means[:, unknown] = found[:, unknown]
-        return _finite(found, means, unknown, rng)
+        return _chosen(self.function, x, [self.motion.ends(x, path)[0] for path in self.paths], rng)
+
+
+@dataclass(frozen=True)
+class Shift:
+    """Noise along one direction: the density after it, and the shift (n, Q) of each term."""
+
+    function: Carried
+    shifts: Array
+
+    def before(self, x: Array, rng: np.random.Generator) -> Led:
+        """Return states before the noise."""
+        return _chosen(self.function, x, [x - shift[:, None] for shift in self.shifts.T], rng)
+
+
+def _chosen(function: Carried, x: Array, ends: list[Array], rng: np.random.Generator) -> Led:
+    """Return for each draw x (n, P) its end by one of the terms of a density, in proportion to their values at x."""
+    values = np.array([np.maximum(replace(function, terms=(term,))(x), 0.0) for term in function.terms])
+    sums = np.cumsum(values, axis=0)
+    unknown = ~(sums[-1] > 0)
+    chosen = np.minimum((sums < rng.random(x.shape[1]) * sums[-1]).sum(axis=0), len(values) - 1)
+    chosen[unknown] = len(values) // 2
+    found, means = np.empty_like(x), np.zeros_like(x)
+    for number, end in enumerate(ends):
+        own, used = chosen == number, values[number] > 0
+        found[:, own] = end[:, own]
+        means[:, used] += (values[number] / np.maximum(sums[-1], 1e-300) * end)[:, used]
+    means[:, unknown] = found[:, unknown]
+    return _finite(found, means, unknown, rng)

@@ -14,7 +14,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zakai.methods.frame.unresolved import Unresolved
 from zakai.numerics.trains.grid import Grid
 
 Array = Any
@@ -32,7 +31,6 @@ LINES = 3  # through the mass, and one more through the point that counts most f
 FIRST_LINE = 40  # points along a line at first; doubled where the spectrum fills half of them
 TAIL = 0.3  # share of the tolerance below which the spectrum of a line is left out
 FINER = 0.7  # factor of the spacing that the lines ask for: they do not see every direction
-CORRELATED = 0.1  # correlation of the noise of a closed angle with that of another state, which no frame holds
 HALF_TURN = 0.45  # reach of an angle in turns, from which its axis is closed
 
 
@@ -218,13 +216,9 @@ def place(
         stretch: a factor of the box.
         order: of the states (n,), in which the frame is triangular.
     """
-    if noise is not None and closed.any() and not closed.all():
-        d = np.sqrt(np.maximum(np.diag(noise), 1e-300))
-        if np.abs(noise / d / d[:, None])[np.ix_(closed, ~closed)].max() > CORRELATED:
-            raise Unresolved("an angle goes around the circle, and its noise is correlated with that of another state")
     mean, P = mass.moments()
     P = without_chance(P, mass.effective)
-    # An angle that goes around has an axis of its own; noise between it and the others is left out.
+    # An angle that goes around has an axis of its own; noise between it and the others is not in the frame: see `Chain`.
     B, D, free = np.eye(len(mean)), np.diag(np.zeros(len(mean)) if noise is None else np.diag(noise)), np.flatnonzero(~closed)
     if len(free):
         rows = order[~closed[order]]

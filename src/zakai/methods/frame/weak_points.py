@@ -1,6 +1,7 @@
 """Noise that depends on the state, as a sum over weak points: the flow of its fields for numbers that stand for its normal noise.
 
-Nothing but values of the density is needed.
+Nothing but values of the density is needed.  So is noise along a direction that no frame has as an axis, where the flows are
+shifts: that of an angle on the whole circle together with what other states have of it.
 
 References:
     Ninomiya and Victoir 2008, Weak approximation of stochastic differential equations.
@@ -24,6 +25,7 @@ from zakai.numerics.trains.carried import Carried, Path, Term
 SPACING = 1.3
 MOST_NODES = 81
 MOST_STEPS = 8  # of Runge-Kutta along a kick
+CORRELATED = 0.02  # correlation of the noise of a closed axis with that of another state, which is left out
 
 
 @dataclass
@@ -43,15 +45,8 @@ class WeakPoints:
         scale = np.maximum(np.sqrt(np.diag(P)), 1e-12)
         moved = (self._ends(mean[:, None], c, 1)[:, 0] - mean) / scale
         unit = P / np.outer(scale, scale) + 1e-9 * np.eye(len(mean))
-        square = float(moved @ np.linalg.solve(unit, moved))
-        spacing = SPACING / math.sqrt(1.0 + square) if math.isfinite(square) else 0.0
         reach = self.builder.rule.width
-        if not reach < 0.5 * (MOST_NODES - 1) * spacing:
-            raise Unresolved(f"the noise of a substep at t = {t:g} is much wider than the density")
-        count = math.ceil(reach / spacing)
-        nodes = spacing * np.arange(-count, count + 1)
-        weights = np.exp(-0.5 * nodes**2)
-        weights = weights / weights.sum()
+        nodes, weights = _nodes(float(moved @ np.linalg.solve(unit, moved)), reach, t)
         steps = self._steps(mass, scale, reach * c)
         (term,), points, shares = function.terms, mass.points.copy(), mass.weights.copy()
         order, terms, paths = np.random.default_rng(1).permutation(points.shape[1]), list[Term](), list[Path]()
@@ -79,3 +74,47 @@ class WeakPoints:
                 return steps
             steps, last = 2 * steps, finer
         return steps
+
+
+def _nodes(square: float, reach: float, t: float) -> tuple[Array, Array]:
+    """Return nodes of a normal number and their weights, for noise with the `square` of its deviation in that of the density."""
+    spacing = SPACING / math.sqrt(1.0 + square) if math.isfinite(square) else 0.0
+    if not reach < 0.5 * (MOST_NODES - 1) * spacing:
+        raise Unresolved(f"the noise of a substep at t = {t:g} is much wider than the density")
+    count = math.ceil(reach / spacing)
+    nodes = spacing * np.arange(-count, count + 1)
+    weights = np.exp(-0.5 * nodes**2)
+    return nodes, weights / weights.sum()
+
+
+def along_closed_axes(Q: Array, closed: Array) -> tuple[list[Array], Array]:
+    """Return the directions (n,) of noise of closed axes together with other states, and the noise (n, n) without them.
+
+    The noise of a closed axis j is a normal number times Q_j / root Q_jj, and independent noise of the other states.
+    """
+    found = list[Array]()
+    for j in np.flatnonzero(closed):
+        scale = np.sqrt(np.maximum(np.diag(Q), 1e-300))
+        if np.abs(np.delete(Q[j] / scale / scale[j], j)).max() > CORRELATED:
+            found.append(Q[j] / scale[j])
+            Q = Q - np.outer(found[-1], found[-1])
+            Q[j] = Q[:, j] = 0.0
+    return found, Q
+
+
+def shifted(function: Carried, mass: Mass, direction: Array, reach: float, t: float) -> tuple[Carried, Mass, Array]:
+    """Return a density after noise along a direction (n,) as a function, points of it, and the shift of each term (n, Q)."""
+    _, P = mass.moments()
+    scale = np.maximum(np.sqrt(np.diag(P)), 1e-12)
+    unit, moved = P / np.outer(scale, scale) + 1e-9 * np.eye(len(P)), direction / scale
+    nodes, weights = _nodes(float(moved @ np.linalg.solve(unit, moved)), reach, t)
+    (term,), points, shares = function.terms, mass.points.copy(), mass.weights.copy()
+    shifts, order, terms = direction[:, None] * nodes, np.random.default_rng(1).permutation(points.shape[1]), list[Term]()
+    for q, weight in enumerate(weights):
+        u = term.density
+        moved_grid = u.grid._replace(centre=u.grid.centre + shifts[:, q])
+        terms.append(term._replace(density=replace(u, grid=moved_grid), scale=np.array([weight * term.scale[0], term.scale[1]])))
+        own = order[q :: len(nodes)]
+        points[:, own] += shifts[:, [q]]
+        shares[own] *= weight
+    return replace(function, terms=tuple(terms)), Mass(points, shares / shares.sum()), shifts
