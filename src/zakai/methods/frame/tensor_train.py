@@ -56,6 +56,10 @@ BOUNDS = {
         1.0, "depth in the tails of the prediction to which an observation leads, divided by the accurate depth. Lower the "
         "tolerance, or compare with guided-particles",
     ),
+    "off_grid_error": (
+        0.05, "share by which the density may be wrong: a part of little mass may be missing, and standard deviations too small. "
+        "Raise most_rank, or compare with guided-particles",
+    ),
     "unknown_draws": (
         0.01, "share of the smoother's draws to which the filter's density does not lead: a Gaussian stands for it. Compare with "
         "guided-particles",
@@ -66,7 +70,7 @@ METHOD: Method[Prepared, State] = Method(
     name="tensor-train",
     source="Oseledets and Tyrtyshnikov 2010 (cross interpolation)",
     exactness="convergent: tensor trains of quintic B-splines in a frame that follows the density; of second order in a substep, "
-    "which is audited",
+    "whose error is measured by points",
     theorem=theorem,
     options={"tolerance": None, "most_rank": MOST_RANK, "choices": None},
     prepare=prepare,
