@@ -336,8 +336,8 @@ def test_a_mode_of_little_mass_a_turn_away_is_kept():
 def test_a_mode_that_the_ranks_cannot_hold_is_reported_as_a_part_that_may_be_missing():
     model = zakai.Model(
         state=["px", "py", "a", "b"], drift=["0.8*cos(a)", "0.8*sin(a)", "0.2", "0"],
-        diffusion=np.diag([0.05, 0.05, 0.1, 0.02]).tolist(), observation=["px", "py", "atan2(sin(a + b), cos(a + b))"], observation_kind="samples",
-        observation_noise=np.diag([0.3, 0.3, 0.05]).tolist(), periodic=["a"],
+        diffusion=np.diag([0.05, 0.05, 0.1, 0.02]).tolist(), observation=["px", "py", "atan2(sin(a + b), cos(a + b))"],
+        observation_kind="samples", observation_noise=np.diag([0.3, 0.3, 0.05]).tolist(), periodic=["a"],
         prior={"kind": "gaussian", "mean": [0] * 4, "cov": np.diag([0.05, 0.05, 1.5, 2.0]).tolist()},
     )  # fmt: skip
     times = np.cumsum(np.random.default_rng(1).uniform(0.2, 0.6, 10))

@@ -23,7 +23,8 @@ from zakai.methods.particles.programs import Array
 from zakai.numerics.trains.carried import Likelihood
 from zakai.numerics.trains.train import Train
 
-POINTS = 512  # each with four noises
+# Points, each with four noises, for a tolerance below this one, and for another: their chance is .2 to .5 of it.
+POINTS, FEWER_POINTS, SMALL = 512, 128, 3e-3
 FEW = 100.0  # effective points that a likelihood must leave, or a power of it is taken
 LEAST = 0.25  # share of the square of an error that is left when that of the points is subtracted
 
@@ -41,8 +42,8 @@ def measured(chain: Chain, u: Train, count: int, likelihood: Likelihood) -> Time
     """Return the error of so many substeps from a density; None where no point stays finite."""
     prepared, interval, motion = chain.prepared, chain.interval, chain.prepared.motion
     angles = prepared.system.base.angles
-    points, weights = u.cloud(2 * POINTS)
-    before = Mass(points[:, ::2], weights[::2] / weights[::2].sum()).unwrapped(angles)
+    number = POINTS if chain.builder.allowed < SMALL else FEWER_POINTS
+    before = Mass(*u.cloud(number)).unwrapped(angles)
     mean, P = before.moments()
     pilots = Pilots(np.tile(before.points, 4), mean, np.maximum(np.sqrt(np.diag(P)), 1e-12), count, 0.0)
     found = coupled(motion.coefficients, interval, chain.values, pilots, count, paired=True)
@@ -65,9 +66,9 @@ def measured(chain: Chain, u: Train, count: int, likelihood: Likelihood) -> Time
     moved, terms = (_monomials(np.linalg.solve(root, part.points - mean[:, None])) for part in (one, other))
     average = (terms @ other.weights)[:, None]
     each = one.weights * (moved - average) - other.weights * (terms - average)
-    each = 4.0 / 3.0 * each.reshape(len(each), 4, POINTS).sum(axis=1)
+    each = 4.0 / 3.0 * each.reshape(len(each), 4, number).sum(axis=1)
     change = each.sum(axis=1)
-    random = (each**2).sum(axis=1) - change**2 / POINTS
+    random = (each**2).sum(axis=1) - change**2 / number
     square = np.maximum(change**2 - random, LEAST * change**2)
     return TimeError(count, math.sqrt(float(square.max())), root @ change[: len(x)], P)
 
