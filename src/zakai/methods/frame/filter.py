@@ -39,6 +39,7 @@ TIME_SHARE, GAIN, SAFETY = 1.0, 4.0, 0.7
 IN_TAILS = 0.03  # error of a mean over tolerance e^depth: linear tracks with observations 4 and 6 deviations away
 BEYOND = 0.3  # error of a mean over the distance of an observation, where a Gaussian stands for the tails
 OF_MEAN = 0.6  # error of a mean over what a motion loses of the mass, what is near an edge, and the error of time in L1
+OF_GRID = 0.1  # error of a mean that control points do not show, over that off the grid in L1: tracks by radar and by bearings
 OF_TAILS = 0.25  # growth of the logarithm of a relative error with the depth, on wide tracks seen by bearings
 DEEP, SHARPEST = 2.0, 0.03  # depth in nats from which a prediction has a smaller tolerance, and the least factor of it
 WITHIN = 3.0  # tolerances that the error of a mean may reach
@@ -205,7 +206,7 @@ def _step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[tupl
     off_grid, edge = sum(report.off_grid for report in reports), max(report.edge for report in reports)
     # Far out a density is known relative to its largest value only; beyond, a Gaussian stands for it.
     far = min(IN_TAILS * rule.tolerance * math.exp(min(depth, 50.0)), BEYOND * math.sqrt(2.0 * max(depth, 0.0)))
-    new = math.hypot(OF_MEAN * (prediction.defect + edge + in_time), far)
+    new = math.hypot(OF_MEAN * (prediction.defect + edge + in_time), OF_GRID * off_grid, far)
     angles = prepared.system.base.angles
     parts = [
         (factor, missed.of_mean(prepared.motion.logs(likelihood, missed.mass.points), cov, angles))
