@@ -295,6 +295,8 @@ def _predicted(chain: Chain, state: State, likelihood: Likelihood) -> Predicted:
         plain, both = count * math.sqrt(change), count * (0.75 / GAIN * change) ** 0.25
         extrapolate = plain > 3.0 * max(both, 1.0)
         wanted = min(max(1, math.ceil((both if extrapolate else plain) - 1e-9)), MOST_SUBSTEPS)
+        if not math.isfinite(error):  # the drift leads to infinity, in however many substeps
+            wanted = count
         if count <= 2 * wanted <= 4 * count:
             break
         count = wanted

@@ -70,6 +70,8 @@ def measured(chain: Chain, u: Train, count: int, likelihood: Likelihood) -> Time
     change = each.sum(axis=1)
     random = (each**2).sum(axis=1) - change**2 / number
     square = np.maximum(change**2 - random, LEAST * change**2)
+    if not np.isfinite(square).all():
+        return None
     return TimeError(count, math.sqrt(float(square.max())), root @ change[: len(x)], P)
 
 
