@@ -105,7 +105,7 @@ def step(prepared: Prepared, k: int, later: Message, values: Array, state: State
     chain = Chain(prepared, prepared.interval(k), values, builder_of(prepared, state))
     rng, x, moments, unknown = _generator(control.interval, later.seed), later.draws, later.moments, 0.0
     try:
-        prediction, _, _, in_time = predicted(chain, state)
+        prediction, _, _, in_time, _ = predicted(chain, state)
     except (Unresolved, np.linalg.LinAlgError):
         return later._replace(draws=np.full_like(x, np.nan), moments=None, error=math.nan, unknown=0.0, last=False)
     for move in reversed(chain.moves):

@@ -9,7 +9,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -17,9 +17,9 @@ from zakai.densities import TensorTrainDensity
 from zakai.densities._values import wrap
 from zakai.methods._protocol import Info
 from zakai.methods.frame import again
-from zakai.methods.frame.build import CONTROLS, Builder, difference
+from zakai.methods.frame.build import Builder, difference
 from zakai.methods.frame.chain import MOST_SUBSTEPS, Chain, Prediction, extrapolated
-from zakai.methods.frame.errors import carried, in_deviations, total
+from zakai.methods.frame.errors import Error, in_deviations, root_of
 from zakai.methods.frame.placement import Mass
 from zakai.methods.frame.state import LONGER, Choice, Control, Made, Prepared, State, Substeps
 from zakai.methods.frame.unresolved import Unresolved
@@ -32,12 +32,12 @@ from zakai.numerics.trains.train import Train, quasi_random
 PRIOR_POINTS, BLOCK = 1024, 1024
 AUDIT = 10  # intervals between comparisons of s and 2 s substeps, where the last one was within bounds
 # The difference of s and 2 s substeps in L1 is the error of s substeps times 3 / 4: with this share of the tolerance s are taken.
+# Errors of substeps have one sign and add up: with the whole tolerance a robot whose heading is not seen is off by 3.5 of them.
 # What is extrapolated from both has a third to a twentieth of it.
-TIME_SHARE, GAIN, ACCEPTED, SAFETY = 1.0, 4.0, 8.0, 0.7
+TIME_SHARE, GAIN, ACCEPTED, SAFETY = 0.5, 4.0, 8.0, 0.7
 IN_TAILS = 0.03  # error of a mean over tolerance e^depth: linear tracks with observations 4 and 6 deviations away
 BEYOND = 0.3  # error of a mean over the distance of an observation, where a Gaussian stands for the tails
 OF_MEAN = 0.6  # error of a mean over what a motion loses of the mass, what is near an edge, and the error of time in L1
-OF_TAILS = 0.25  # growth of the logarithm of a relative error with the depth, on wide tracks seen by bearings
 WITHIN = 3.0  # tolerances that the error of a mean may reach
 FIGURES = (
     "error_estimate", "tolerance_ratio", "rank", "mass_defect", "off_grid_error", "edge_mass", "tail_depth", "powers",
@@ -65,8 +65,8 @@ def init(prepared: Prepared, prior: Any) -> State:
         choices.made[key] = made
     assert model.n == len(mass.points) and len(theta) == len(prepared.theta)
     _, P = mass.unwrapped(system.base.angles).moments()
-    error = builder.missed.of_mean(np.zeros(len(builder.missed.relative)), P, system.base.angles)
-    control = Control(0, Substeps(1.0, 0.0, -AUDIT, False, 0.0), error.square)
+    error = builder.missed.after(np.zeros(len(builder.missed.relative)), P, system.base.angles)
+    control = Control(0, Substeps.one(model.n, -AUDIT), error)
     return State.of(v.scaled(1.0 / v.mass), control)
 
 
@@ -189,7 +189,7 @@ def _step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[tupl
         return again.step(Chain(prepared, interval, values, Builder(prepared)), state, known, FIGURES), 0.0
     builder = builder_of(prepared, state)
     chain = Chain(prepared, interval, values, builder)
-    prediction, count, time, in_time = predicted(chain, state)
+    prediction, count, time, in_time, of_time = predicted(chain, state)
     likelihood = prepared.motion.likelihood(interval, values)
     updated = update(builder, prediction, likelihood)
     v, rule = updated.density, builder.rule
@@ -202,18 +202,19 @@ def _step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[tupl
     off_grid, edge = sum(report.off_grid for report in reports), max(report.edge for report in reports)
     # Far out a density is known relative to its largest value only; beyond, a Gaussian stands for it.
     far = min(IN_TAILS * rule.tolerance * math.exp(min(depth, 50.0)), BEYOND * math.sqrt(2.0 * max(depth, 0.0)))
-    new = math.hypot(OF_MEAN * (prediction.defect + edge + in_time), far)
+    new = math.hypot(OF_MEAN * (prediction.defect + edge), far)
     angles = prepared.system.base.angles
-    parts = [
-        (factor, missed.of_mean(prepared.motion.logs(likelihood, missed.mass.points), cov, angles))
-        for factor, missed in prediction.missed
-    ]
-    parts.append((1.0, builder.missed.of_mean(np.zeros(len(builder.missed.relative)), cov, angles)))
-    # Where an observation leads into the tails, the relative errors of earlier builds are larger.
-    larger = math.exp(2.0 * OF_TAILS * min(max(depth, 0.0), 50.0))
-    before = carried(control.error, prediction.mass.unwrapped(angles), prediction.slope, cov)
-    errors = larger * before + new**2 * cov + total(parts, len(mean)).square
-    error = in_deviations(errors, cov)
+    own = builder.missed.after(np.zeros(len(builder.missed.relative)), cov, angles)
+    for factor, missed in prediction.missed:
+        own = own.plus(missed.after(prepared.motion.logs(likelihood, missed.mass.points), cov, angles), factor)
+    m, P = prediction.mass.unwrapped(angles).moments()
+    root, before, after = root_of(P), root_of(state.train(prepared.system.periods).moments()[1]), root_of(cov)
+    shift = mean - m
+    shift[angles] = wrap(shift[angles])
+    errors = control.error.along(np.linalg.solve(root, prediction.slope @ before)).plus(of_time)
+    errors = errors.seen(np.linalg.solve(root, after), np.linalg.solve(root, shift)).plus(own)
+    errors = errors.plus(Error.by_chance(len(mean), new))
+    error = in_deviations(errors.of_mean(after), cov)
     health = {
         "error_estimate": error,
         "tolerance_ratio": error / (WITHIN * prepared.tolerance),
@@ -228,13 +229,14 @@ def _step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[tupl
         "effective_share": updated.effective,
     }
     lost = max(chain.lost, prediction.defect)
-    after = Control(control.interval + 1, time, errors, builder.after())
-    return (State.of(v, after), Info(updated.log_evidence, mean, cov, health)), lost
+    control = Control(control.interval + 1, time, errors, builder.after())
+    return (State.of(v, control), Info(updated.log_evidence, mean, cov, health)), lost
 
 
 def error_of(prepared: Prepared, state: State) -> float:
     """Return the estimated error of the mean of a state, in standard deviations."""
-    return in_deviations(state.control.error, state.train(prepared.system.periods).moments()[1])
+    P = state.train(prepared.system.periods).moments()[1]
+    return in_deviations(state.control.error.of_mean(root_of(P)), P)
 
 
 def builder_of(prepared: Prepared, state: State) -> Builder:
@@ -242,28 +244,42 @@ def builder_of(prepared: Prepared, state: State) -> Builder:
     return Builder(prepared, error_of(prepared, state), state.control.looser)
 
 
-def predicted(chain: Chain, state: State) -> tuple[Prediction, int, Substeps, float]:
-    """Return the prediction over an interval, the number of its substeps, how the next are divided, and the error in time."""
+class Predicted(NamedTuple):
+    """A prediction, the number of its substeps, how the next are divided, and the error of substeps in L1 and of the density."""
+
+    prediction: Prediction
+    substeps: int
+    time: Substeps
+    in_time: float
+    error: Error
+
+
+def predicted(chain: Chain, state: State) -> Predicted:
+    """Return the prediction over an interval."""
     prepared, interval, time = chain.prepared, chain.interval, state.control.time
     length, number = interval.stop - interval.start, state.control.interval + 1
-    count = min(max(1, math.ceil(time.needed(length) - 1e-9)), MOST_SUBSTEPS)
     u = state.train(prepared.system.periods)
+    root = root_of(u.moments()[1])
+    narrower, relative = time.narrowed(root)
+    count = min(max(1, math.ceil(time.needed(length) - 1e-9)), MOST_SUBSTEPS)
     prediction, count = chain.first(u, count)
     exact = prepared.system.base.affine and prepared.system.base.sampled and not prepared.system.base.driven
-    if length > 0 and not exact and (time.both or length > LONGER * time.length or number - time.audited >= AUDIT):
+    factor = time.factor(length, count)
+    in_time = narrower * factor * time.error
+    due = time.both or length > LONGER * time.length or in_time > chain.builder.allowed or number - time.audited >= AUDIT
+    if length > 0 and not exact and due:
         return _audited(chain, u, prediction, count, number)
-    return prediction, count, time, time.left(length, count)
+    return Predicted(prediction, count, time, in_time, relative.scaled(factor))
 
 
-def _audited(
-    chain: Chain, u: Train, coarser: Prediction, count: int, number: int
-) -> tuple[Prediction, int, Substeps, float]:
-    """Return the prediction extrapolated from s and 2 s substeps, 2 s, what their difference says of the next, and its error."""
+def _audited(chain: Chain, u: Train, coarser: Prediction, count: int, number: int) -> Predicted:
+    """Return the prediction extrapolated from s and 2 s substeps, and what their difference says of the next."""
     allowed, length = TIME_SHARE * chain.builder.allowed, chain.interval.stop - chain.interval.start
     while True:
         finer, more = chain.first(u, 2 * count)
-        control = finer.mass.control(CONTROLS, chain.prepared.tolerance)
-        error = difference(coarser.function.scaled(coarser.log_scale - finer.log_scale), finer.function, control)
+        scale = coarser.log_scale - finer.log_scale
+        apart = difference(coarser.function.scaled(scale), finer.function, finer.mass, chain.prepared.tolerance)
+        error = apart.size
         # What the builds of both differ by is not an error of time.
         error = max(error - sum(report.off_grid for report in chain.builder.reports), 0.3 * error)
         if error < ACCEPTED * allowed or 2 * more > MOST_SUBSTEPS:
@@ -273,11 +289,13 @@ def _audited(
     plain = 0.5 * more * max(0.5, math.sqrt(error / (SAFETY * allowed)))
     both = 0.5 * more * max(0.5, (error / (GAIN * SAFETY * allowed)) ** 0.25)
     extrapolate = plain > 3.0 * both
-    left = 4.0 / 3.0 * error * (0.5 * more / plain) ** 2
-    found = Substeps(both if extrapolate else plain, length, number, extrapolate, left)
+    left, angles = 4.0 / 3.0 * (0.5 * more / plain) ** 2, chain.prepared.system.base.angles
+    relative = apart.after(np.zeros(len(apart.relative)), finer.mass.unwrapped(angles).moments()[1], angles)
+    root = root_of(u.moments()[1])
+    time = Substeps(both if extrapolate else plain, length, number, extrapolate, left * error, relative.scaled(left), root)
     extra = extrapolated(finer, coarser)
     motions = (*finer.motions, *coarser.motions)
     missed = [(4.0 / 3.0 * factor, part) for factor, part in finer.missed]
     missed += [(-1.0 / 3.0 * factor, part) for factor, part in coarser.missed]
     answer = Prediction(extra, finer.mass, finer.log_mass, finer.defect, finer.slope, motions, tuple(missed))
-    return answer, more, found, error / GAIN
+    return Predicted(answer, more, time, error / GAIN, Error.by_chance(u.grid.n, OF_MEAN * error / GAIN))

@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from zakai.methods.frame.errors import Error
 from zakai.methods.frame.motion import Motion, System
 from zakai.methods.particles.interval import Interval
 from zakai.methods.particles.programs import Array
@@ -26,7 +27,9 @@ LONGER = 2.0
 class Substeps(NamedTuple):
     """How intervals are divided, by the last comparison of s and 2 s substeps, in the interval `audited`.
 
-    So many `substeps` leave the `error` in L1 in an interval of that `length`; with `both`, s and 2 s are always extrapolated.
+    So many `substeps` leave the `error` in L1 in an interval of that `length`, for a density whose covariance has the `root`
+    (n, n) at the start; with `both`, s and 2 s are always extrapolated.  The errors of such intervals have one sign, that of
+    `relative`, the error of the prediction: they displace a density, whatever its width.
     """
 
     substeps: float
@@ -34,27 +37,38 @@ class Substeps(NamedTuple):
     audited: int
     both: bool
     error: float
+    relative: Error
+    root: Array
+
+    @classmethod
+    def one(cls, n: int, audited: int) -> Substeps:
+        """Return one substep for every interval."""
+        return cls(1.0, 0.0, audited, False, 0.0, Error.zero(n), np.eye(n))
+
+    def narrowed(self, root: Array) -> tuple[float, Error]:
+        """Return by what factor the errors are larger in a density of that root, at least one, and its error."""
+        relative, size = self.relative.along(np.linalg.solve(root, self.root)), self.relative.size
+        return max(1.0, relative.size / size) if size > 0 else 1.0, relative
 
     def needed(self, length: float) -> float:
         """Return how many substeps an interval needs; substeps of length d have an error in proportion to `length` d^2."""
         ratio = length / self.length if self.length > 0 else 0.0
         return self.substeps * ratio * math.sqrt(min(max(ratio, 1.0), LONGER))
 
-    def left(self, length: float, count: int) -> float:
-        """Return the error that so many substeps leave in an interval."""
-        return self.error * (length / self.length) ** 3 * (self.substeps / count) ** 2 if self.length > 0 else 0.0
+    def factor(self, length: float, count: int) -> float:
+        """Return what so many substeps leave in an interval, in terms of the error."""
+        return (length / self.length) ** 3 * (self.substeps / count) ** 2 if self.length > 0 else 0.0
 
 
 class Control(NamedTuple):
     """What decides the next step beside the density.
 
-    The number of intervals, the substeps, the estimated error of the mean, as a covariance (n, n), and the factor of the
-    tolerance where ranks met their limit.
+    The number of intervals, the substeps, the estimated error, and the factor of the tolerance where ranks met their limit.
     """
 
     interval: int
     time: Substeps
-    error: Array
+    error: Error
     looser: float = 1.0
 
 
