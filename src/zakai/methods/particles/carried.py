@@ -57,10 +57,14 @@ def step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[State
     if _given_away(own, k, state):
         return other
     found = particle_filter.step(own, k, state, values)
-    before = state.control.losses
-    errors, others = ((after.control.losses - before) * _work(p, k, (after, info), values)
-                      for p, (after, info) in ((own, found), (own.plain, other)))  # fmt: skip
+    both = ((own, found), (own.plain, other))
+    errors, others = (_loss(state, *done) * _work(p, k, done, values) for p, done in both)
     return found if errors <= LATER * others else other
+
+
+def _loss(before: State, after: State, info: Info) -> float:
+    """Return the variance of the means that a step reports, times the number of particles, infinite where it has failed."""
+    return after.control.losses - before.control.losses if np.isfinite(info.mean).all() else np.inf
 
 
 def _work(prepared: Prepared, k: int, done: tuple[State, Info], values: Array) -> float:

@@ -14,6 +14,7 @@ References:
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -260,7 +261,7 @@ def _step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[Stat
 
 def _allowed(control: Control, count: int) -> float:
     """Return the error of a mean by the time step, in standard deviations, that an interval may have."""
-    return float(np.clip(OF_RANDOM_ERROR * np.sqrt(control.variance / count), TIME_ERROR, MOST_TIME_ERROR))
+    return min(max(OF_RANDOM_ERROR * math.sqrt(control.variance / count), TIME_ERROR), MOST_TIME_ERROR)
 
 
 def substeps(
@@ -308,7 +309,7 @@ def _observed(prepared: Prepared, interval: Interval, values: Array) -> Observed
     system, theta, t = prepared.system, prepared.theta, interval.stop
     u = None if interval.inputs is None else interval.inputs.at(t, system.model.input_hold)
     if system.law is not None:
-        return Observed(t, *system.law.given(values, interval.seen, t, theta, u))
+        return Observed(t, *system.law.given(values, interval.seen, prepared.motion.law_parameters(t, u), u))
     m, late = system.m, np.flatnonzero(interval.seen & ~interval.inside)
     P = np.zeros((m, m))
     if len(late):
@@ -366,9 +367,8 @@ class Drawn(NamedTuple):
 
 def _narrowing(cov: Array, before: Array) -> float:
     """Return the smallest ratio of the deviations of a state after and before the observation."""
-    wide = before > 0
-    ratios = np.sqrt(np.maximum(np.diag(cov), 0.0))[wide] / before[wide]
-    return float(np.clip(np.nanmin(ratios, initial=1.0), NARROWEST, 1.0))
+    ratios = np.sqrt(np.maximum(np.diag(cov), 0.0)) / before
+    return min(max(min((ratio for ratio in ratios.tolist() if ratio >= 0.0), default=1.0), NARROWEST), 1.0)
 
 
 def _linearised(target: Target, cloud: Cloud, plain: Advanced) -> Any:

@@ -63,7 +63,7 @@ class Events(NamedTuple):
     @property
     def width(self) -> int:
         """The number of standard normal numbers of a particle."""
-        return int(self.rows[-1].sum()) if len(self.rows) else 0
+        return sum(self.rows[-1].tolist()) if len(self.rows) else 0
 
 
 class Flows(NamedTuple):
@@ -86,7 +86,8 @@ def with_update(events: Events, system: System, observed: Observed) -> Events:
     """Return the events of an interval and the update of the state by the observation at its end, where there is one."""
     if system.update is None:
         return events
-    given = np.pad(events.given, ((0, 0), (0, 0), (0, system.width - events.given.shape[2])))
+    given = np.zeros((len(events.given), 2, system.width))
+    given[:, :, : events.given.shape[2]] = events.given
     if not observed.counted.any():
         return events._replace(given=given)
     row = np.zeros((1, 2, system.width))
@@ -130,6 +131,17 @@ class Motion:
         """The law of a sample, or the factor of an increment gathered over more than its interval."""
         system = self.system
         return tuple(system.law.program(self.theta) if system.law is not None else system.factor.at(self.theta))  # type: ignore[union-attr]
+
+    def law_parameters(self, t: float, u: Array | None) -> tuple[Array, Array]:
+        """Return what the law of a sample receives of its parameters."""
+        law = self.system.law
+        assert law is not None
+        return self._law_parameters if law.constant else law.parameters(t, self.theta, u)
+
+    @cached_property
+    def _law_parameters(self) -> tuple[Array, Array]:
+        assert self.system.law is not None
+        return self.system.law.parameters(float(self.system.model.start), self.theta, None)
 
     @cached_property
     def observe(self) -> tuple[Any, ...]:
@@ -189,7 +201,8 @@ class Motion:
         """Return the largest drift of a mean (n,) at the start of an interval, in deviations (n,) by time."""
         given = self.given_numbers(interval, np.array([[interval.start, interval.stop]]), values)
         f = self.values(self.arrays[0], mean[:, None], interval.start, given[0, 0])[: len(mean), 0]
-        return float(np.nan_to_num(np.abs(f) / scale, nan=np.inf).max())
+        largest = float((np.abs(f) / scale).max())
+        return np.inf if np.isnan(largest) else largest
 
     def steepness(self, interval: Interval, values: Array, mean: Array, scale: Array) -> float:
         """Return the norm of df/dx at a mean (n,) at the start of an interval, with the states in deviations (n,)."""
