@@ -8,9 +8,9 @@ interval of length d has the information
 about v.  If that is large the path gives v away: drawing it is then as hard as drawing v, and moves of the past, which reach v in
 one piece, leave a smaller error.
 
-The equations of m and P are longer than those of v, and need more substeps where P changes fast.  So the first interval is
-filtered in both ways, and the filters are left out where their error^2 x work exceeds that of draws by more than `LATER`: the
-variances of the means are those after the interval, the work is counted in the next one, if it is as long.
+The equations of m and P are longer than those of v, and need more substeps where P changes fast.  So few particles filter the
+first interval in both ways, and the filters are left out where their error^2 x work exceeds that of draws by more than `LATER`:
+the variances of the means are those after the interval, the work is counted in the next one, if it is as long.
 """
 
 from __future__ import annotations
@@ -25,9 +25,10 @@ from zakai.methods._protocol import Backward, Info
 from zakai.methods.particles import filter as particle_filter
 from zakai.methods.particles.backward import BACKWARD as PLAIN_BACKWARD
 from zakai.methods.particles.conditional import ConditionalSystem, covariances
+from zakai.methods.particles.interval import TIME_ERROR
 from zakai.methods.particles.moments import moments_of
 from zakai.methods.particles.programs import Array
-from zakai.methods.particles.state import Prepared, State
+from zakai.methods.particles.state import Cloud, Prepared, Rule, State
 from zakai.methods.particles.system import root
 from zakai.methods.particles.validity import valid as valid_state
 from zakai.numerics.particles.random import normals
@@ -40,7 +41,8 @@ GIVEN_AWAY = 4.0
 # 0.02 to 0.4 of the merit of draws, else 0.7 to 70; on nine others, all of which show more, 0.9 to 25.
 LATER = 4.0
 OF_LEVEL = 4.0  # times that a power of the likelihood, with its moves, follows the particles through an interval
-_DRAWS = 101  # use of random numbers, beside those of the filter and of smoothing
+TRIED, SUBSTEPS = 1024, 8  # particles by which that is measured, and substeps of the first interval
+_DRAWS, _TRIAL = 101, 102  # uses of random numbers, beside those of the filter and of smoothing
 
 
 def suited(prepared: Prepared, state: State) -> Prepared:
@@ -51,32 +53,47 @@ def suited(prepared: Prepared, state: State) -> Prepared:
 def step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[State, Info]:
     """Advance by interval k of the schedule, then use what is observed at its stop."""
     own, interval = suited(prepared, state), prepared.interval(k)
-    if not own.system.linear or own.rule.split or state.control.length or interval.stop <= interval.start:
-        return particle_filter.step(own, k, state, values)
-    other = particle_filter.step(own.plain, k, drawn_at_start(own, state), values)
-    if _given_away(own, k, state):
-        return other
-    found = particle_filter.step(own, k, state, values)
-    both = ((own, found), (own.plain, other))
-    errors, others = (_loss(state, *done) * _work(p, k, done, values) for p, done in both)
-    return found if errors <= LATER * others else other
+    decided = not own.system.linear or own.rule.split or state.control.length > 0 or interval.stop <= interval.start
+    if not decided and (_given_away(own, k, state) or not _saves_time(own, k, state, values)):
+        own, state = own.plain, drawn_at_start(own, state)
+    return particle_filter.step(own, k, state, values)
 
 
-def _loss(before: State, after: State, info: Info) -> float:
-    """Return the variance of the means that a step reports, times the number of particles, infinite where it has failed."""
-    return after.control.losses - before.control.losses if np.isfinite(info.mean).all() else np.inf
+def _saves_time(prepared: Prepared, k: int, state: State, values: Array) -> bool:
+    """Return whether the filters have a smaller error^2 x work than draws, by few particles."""
+    rule, number, interval = prepared.rule, len(state.log_weights), prepared.interval(k)
+    count = min(TRIED, number)
+    cloud = Cloud(state.particles, state.log_weights, state.window, state.genealogy)
+    cloud, _ = cloud.resampled(np.exp(state.log_weights), count, prepared.key(state.control.interval, _TRIAL))
+    own, few = replace(prepared, rule=Rule(count, count, None, rule.seed, False)), State(*cloud, *state[4:])
+    figures = []
+    for one, before in ((own, few), (own.plain, drawn_at_start(own, few))):
+        control = before.control._replace(
+            length=interval.stop - interval.start, variance=before.control.variance * count / number,
+            substeps=SUBSTEPS, stages=4, error=TIME_ERROR, trusted=1, pace=np.inf, steepness=np.inf,
+        )  # fmt: skip
+        before = before._replace(control=control, last_scale=_about(one, before)[1])
+        after, info = particle_filter.step(one, k, before, values)
+        failed = not np.isfinite(info.mean).all()
+        loss = np.inf if failed else after.control.losses - before.control.losses
+        figures.append(loss * _work(one, k, (after, info), values))
+    return figures[0] <= LATER * figures[1]
 
 
 def _work(prepared: Prepared, k: int, done: tuple[State, Info], values: Array) -> float:
     """Return the operations on a particle in an interval as long as k, after interval k and as it was observed."""
-    system, motion, (state, info) = prepared.system, prepared.motion, done
-    spread, control = moments_of(system, state.particles, np.exp(state.log_weights)), state.control
-    about = spread.mean, control.narrow * np.maximum(system.scales(spread.cov), 1e-12)
-    state = state._replace(control=control._replace(trusted=0))
-    steps, _ = particle_filter.substeps(prepared, prepared.interval(k), values, state, about)
+    motion, (state, info) = prepared.motion, done
+    again = state._replace(control=state.control._replace(trusted=0))
+    steps, _ = particle_filter.substeps(prepared, prepared.interval(k), values, again, _about(prepared, state))
     events = state.window.events[state.window.length - 1]
     times = 1.0 + info.health["guided"] + OF_LEVEL * info.health["tempering_levels"]
     return times * motion.operations(steps.scheme, events.width // max(len(events.rows), 1))
+
+
+def _about(prepared: Prepared, state: State) -> tuple[Array, Array]:
+    """Return the mean of the coordinates, and the deviations in which the error of the time step is measured."""
+    spread = moments_of(prepared.system, state.particles, np.exp(state.log_weights))
+    return spread.mean, state.control.narrow * np.maximum(prepared.system.scales(spread.cov), 1e-12)
 
 
 def _given_away(prepared: Prepared, k: int, state: State) -> bool:
