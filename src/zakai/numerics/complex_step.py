@@ -17,6 +17,9 @@ from numpy.typing import NDArray
 
 STEP = 1e-150
 Array = NDArray[Any]
+Number = float | complex  # with an imaginary part where a derivative is carried
+Number = float | complex  # with an imaginary part where a derivative is carried
+Number = float | complex  # with an imaginary part where a derivative is carried
 
 
 def is_complex(*arrays: Any) -> bool:

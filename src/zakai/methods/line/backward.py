@@ -13,6 +13,7 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from zakai.densities import Density
 from zakai.methods._protocol import Backward, Info, Infos
@@ -29,7 +30,7 @@ from zakai.methods.line.update import acting_inside, factor_of, state_moments, s
 from zakai.numerics.line import window as lw
 from zakai.numerics.line.density import support
 
-Array = Any
+Array = NDArray[Any]
 
 KINKED = 16.0  # points of a likelihood with kinks in the spacing that a message needs
 

@@ -12,6 +12,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from zakai.methods.line.coefficients import covariance_at, resolved_parts
 from zakai.methods.line.domain import ends_of_leak
@@ -29,7 +30,7 @@ from zakai.numerics.line.resolution import ROUNDING as PRECISION
 from zakai.numerics.line.resolution import SMOOTHER_SHARE, SPECTRUM_FACTOR, TRIALS
 from zakai.numerics.line.window import local_polynomial
 
-Array = Any
+Array = NDArray[Any]
 
 def by_exponentials(
     prepared: Prepared, interval: TimeInterval, state: State, later: Message, accepted: float
@@ -80,7 +81,7 @@ def _transposed(
             continue
         total = float(np.sum(trial.values))
         error += np.inf if trial.split else trial.error
-        top += trial.offset + float(np.log(total))
+        top += float(trial.offset.real + np.log(total))
         values = trial.values / total
     return values, top, error
 
@@ -144,7 +145,7 @@ def _by_kernel(
         return None
     report, k = Report(), interval.k
     kernel = kernel_of(prepared, interval, later.window, report)
-    if kernel is None or not kernel.variance > 0:
+    if kernel is None or not kernel.variance.real > 0:
         return None
     deviation, (low, high) = float(np.sqrt(kernel.variance)), later.ends
     if (high - low) > MOST_POINTS * WIDTH * deviation:

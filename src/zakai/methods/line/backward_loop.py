@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from zakai.methods._protocol import Infos
 from zakai.methods.line.backward_interval import negligible, smoothing_tolerance
@@ -26,7 +27,7 @@ from zakai.numerics.line.resolution import ROUNDING as PRECISION
 from zakai.numerics.line.resolution import SMOOTHER_SHARE
 from zakai.numerics.line.steps import SPLIT, SPLIT_FACTOR
 
-Array = Any
+Array = NDArray[Any]
 
 STRIDES = (1, 2, 4)  # points of psi in a spacing of the filter's grid
 APART = 32  # the ends of a grid for a decomposition are multiples of so many spacings

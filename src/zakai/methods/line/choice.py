@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from zakai.methods.line.coefficients import on_grid_for_drift
 from zakai.methods.line.kernel import by_kernel, kernel_of
@@ -24,7 +25,7 @@ from zakai.numerics.line import window as lw
 from zakai.numerics.line.gaussian_kernels import Channel
 from zakai.numerics.line.grid_choice import FAR
 
-Array = Any
+Array = NDArray[Any]
 
 
 @dataclass

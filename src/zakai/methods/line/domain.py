@@ -28,6 +28,7 @@ from typing import Any
 
 import numpy as np
 import sympy as sp
+from numpy.typing import NDArray
 
 from zakai.densities.mapped import IntervalMap
 from zakai.errors import InputError
@@ -41,7 +42,7 @@ from zakai.models.numeric import numpy_function
 from zakai.numerics.line import window as lw
 from zakai.numerics.line.resolution import EDGE, SUPPORT, TRANSITION_SHARE
 
-Array = Any
+Array = NDArray[Any]
 
 # attributes that a model computes from its formulas
 _DERIVED = ("text", "observation_law", "covariance", "features", "depends_on_time", "_kept")
@@ -80,10 +81,10 @@ def on_the_line(model: Model) -> Model:
 
     arranged = sp.expand if np.isinf(variable.upper - variable.lower) else sp.together
 
-    def transformed(formula: sp.Expr, factor: Any = 1, more: Any = 0) -> sp.Expr:
+    def transformed(formula: sp.Expr, factor: sp.Expr | int = 1, more: sp.Expr | int = 0) -> sp.Expr:
         return sp.powsimp(arranged(formula.subs(w, x) * factor + more))
 
-    def matrix(formulas: sp.MatrixBase, factor: Any = 1) -> sp.ImmutableMatrix:
+    def matrix(formulas: sp.MatrixBase, factor: sp.Expr | int = 1) -> sp.ImmutableMatrix:
         return sp.ImmutableMatrix(formulas.applyfunc(lambda entry: transformed(entry, factor)))
 
     ito = -model.covariance[0, 0].subs(w, x) * second / (2 * first**3)

@@ -17,6 +17,7 @@ from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from zakai.densities import Density, GridDensity, MappedDensity
 from zakai.methods._protocol import Info, Infos
@@ -44,13 +45,14 @@ from zakai.methods.line.update import (
 )
 from zakai.methods.line.update import init as init
 from zakai.models.model import Model
+from zakai.numerics.complex_step import Number
 from zakai.numerics.line import window as lw
 from zakai.numerics.line.density import separated
 from zakai.numerics.line.product import General, multiplied
 from zakai.numerics.line.resolution import noise_bound
 from zakai.records.schedule import Schedule
 
-Array = Any
+Array = NDArray[Any]
 
 SLOW = 1e-2  # of the tolerance: the spectrum that need not be resolved where f has kinks
 SLOW_GENEROUS = 256  # points of a grid that is retained though fewer would do
@@ -173,7 +175,8 @@ def single(prepared: Prepared, k: int, state: State, observed: np.ndarray) -> Si
         state, info = _of_parts(parts, 0, state, observed)
         return SingleStep(state, info, (), np.asarray(state.values), state.window, parts)
     transitions: tuple[RecordedTransition, ...] = ()
-    before, gained, contraction = lw.moments(values, window), 0.0, 1.0
+    before, contraction = lw.moments(values, window), 1.0
+    gained: Number = 0.0
     if length > 0:
         prediction, contraction = predicted(prepared, values, window, prepared.interval(k, inside, observed), report)
         values, window, gained, check, transitions = prediction

@@ -16,16 +16,16 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.special import expit
 
-from zakai.methods.line.coefficients import coefficients, covariance_at, resolved_parts
+from zakai.methods.line.coefficients import Coefficients, coefficients, covariance_at, resolved_parts
 from zakai.methods.line.message import LOWEST, SURE, Message, reliable
 from zakai.methods.line.model import finite
 from zakai.methods.line.prepared import Prepared, State, TimeInterval
 from zakai.methods.line.report import Report
 from zakai.methods.line.transition import (
     MOST_SUBSTEPS,
-    Coefficients,
     Substep,
     Trial,
     by_substeps,
@@ -39,7 +39,7 @@ from zakai.numerics.line.backward import FEWEST, ROUNDING
 from zakai.numerics.line.density import support
 from zakai.numerics.line.resolution import SUPPORT, TRIALS
 
-Array = Any
+Array = NDArray[Any]
 
 DEGREE = 8  # of the polynomial l that follows a density
 DEPTH = -20.0  # logarithm of the density, relative to its maximum, beyond which l is linear
@@ -313,12 +313,12 @@ def _substep(
         d = (f - velocity) / (s * spacing) - growth * points
         g = G.reshape(len(times), -1) / (s * spacing) ** 2
         added = (0.5 * g * derivative - d) * derivative - 0.5 * g * curvature
-        return d - g * derivative, g if G.ndim > 1 else g[:, 0], V + added, constant
+        return Coefficients(d - g * derivative, g if G.ndim > 1 else g[:, 0], V + added, constant)
 
     by, _, s = place(np.array([-length]))
     unit = lw.Window(0.0, 0.0, 1.0, window.size, False, 1.0)
     trial = magnus(prepared, later.values, unit, Substep(start, length, inside, rates), at, True, not is_fixed)
     total = float(np.sum(trial.values.real))
     before = window._replace(centre=window.centre + float(by[0]), spacing=spacing * float(s[0]))
-    scale = later.scale + float(trial.offset) + float(np.log(total))
+    scale = later.scale + float(trial.offset.real) + float(np.log(total))
     return trial, later._replace(values=trial.values / total, window=before, scale=scale, scaled=scaled)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from zakai.methods.line.prepared import Prepared, TimeInterval
 from zakai.methods.line.report import Report
@@ -13,7 +14,7 @@ from zakai.numerics.line import window as lw
 from zakai.numerics.line.gaussian_kernels import WIDE, Channel, applied, around, chosen, wrapped
 from zakai.numerics.line.resolution import noise_bound
 
-Array = Any
+Array = NDArray[Any]
 
 NARROWEST = 1.4  # spacings that the standard deviation of a kernel must have
 MOST_GRIDS = 13
@@ -42,7 +43,7 @@ def _around(prepared: Prepared, values: Array, window: lw.Window, kernel: Channe
     """Return a density on the circle convolved with a wrapped Gaussian, None where the kernel is none or too narrow."""
     if np.iscomplexobj(values) or np.iscomplexobj(kernel.variance) or np.iscomplexobj(kernel.shift):
         return None
-    variance = kernel.variance / window.spacing**2
+    variance = kernel.variance.real / window.spacing**2
     if kernel.scale != 1.0 or kernel.slope != 0.0 or kernel.curvature != 0.0 or not variance >= WIDE:
         return None
     result = np.array(values, float)

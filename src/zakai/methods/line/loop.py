@@ -10,6 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from zakai.methods._protocol import Info, Infos
 from zakai.methods._states import Joined, StackedStates
@@ -39,7 +40,7 @@ from zakai.numerics.line.steps import (
     Status,
 )
 
-Array = Any
+Array = NDArray[Any]
 
 BLOCK = 2048  # points by which the tables of a spacing are apart; a table has twice as many
 LOBATTO = np.array([0.0, 0.5 - 0.5 / np.sqrt(5.0), 0.5 + 0.5 / np.sqrt(5.0)])  # nodes within a spacing

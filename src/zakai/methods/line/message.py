@@ -10,6 +10,7 @@ from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from zakai.methods.line.cache import Derived
 from zakai.methods.line.coefficients import decomposed
@@ -19,7 +20,7 @@ from zakai.numerics.line.backward import FEWEST
 from zakai.numerics.line.operator import Spectral
 from zakai.numerics.line.window import local_polynomial
 
-Array = Any
+Array = NDArray[Any]
 
 FALL = 3.3  # spacings over which F falls
 HALF = 14.0  # spacings from where F is one to where it is one half
@@ -74,7 +75,7 @@ class Message(NamedTuple):
         """Return log b at offsets from the origin (J,), beyond the grid with the slope at its ends where b falls outward."""
         result = self.at(offsets)
         (low, high), (left, right) = self.ends, np.maximum(self.logs[[3, -4]] - self.logs[[0, -1]], 0.0) / (3.0 * self.spacing)
-        return result - left * np.maximum(low - offsets, 0.0) - right * np.maximum(offsets - high, 0.0)
+        return np.asarray(result - left * np.maximum(low - offsets, 0.0) - right * np.maximum(offsets - high, 0.0))
 
     def between(self, low: float, high: float) -> Message:
         """Return the message on its points between two offsets, and on those that hold them."""
@@ -108,7 +109,7 @@ def taper(offsets: Array, ends: tuple[float, float], spacing: float) -> Array:
     from scipy.special import erfc
 
     beyond = np.maximum(ends[0] - offsets, offsets - ends[1]) / spacing
-    return 0.5 * erfc((beyond - HALF) / FALL)
+    return np.asarray(0.5 * erfc((beyond - HALF) / FALL))
 
 
 def covering(window: lw.Window, low: float, high: float, spacing: float) -> lw.Window:

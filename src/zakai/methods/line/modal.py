@@ -16,6 +16,7 @@ from threading import Lock
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from zakai.methods.line.cache import CacheKey, Derived
 from zakai.methods.line.coefficients import covariance_at, gauge_at, profile_of, spectral
@@ -29,7 +30,7 @@ from zakai.numerics.line.product import General, at_nodes, nodes, weaken
 from zakai.numerics.line.resolution import TRIALS, edge_bound, rounding_bound, spectrum_bound
 from zakai.numerics.line.steps import COLUMNS, STATUSES, Status
 
-Array = Any
+Array = NDArray[Any]
 
 TOGETHER = 8  # intervals whose likelihoods are computed together
 NEW = 12  # coarse grids and rows that are made for one step

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import sympy as sp
+from numpy.typing import NDArray
 
 from zakai.methods.system.outside_tables import OutsideTables
 from zakai.models.angles import without_branch
@@ -18,7 +19,7 @@ from zakai.models.model import Model
 from zakai.models.numeric import numpy_function
 from zakai.records.inputs import Inputs
 
-Array = Any
+Array = NDArray[Any]
 Function = Callable[..., Array]
 
 _JUMPS = (sp.sign, sp.Heaviside, Floor, sp.atan2)

@@ -13,6 +13,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from sympy import sympify
 
 from zakai.methods._protocol import Infos, Tangents
@@ -24,13 +25,13 @@ from zakai.methods.line.parts import segment_of_parts
 from zakai.methods.line.prepared import Parts, Prepared, State
 from zakai.methods.line.transition import RecordedTransition, Substep, exponents_of
 from zakai.methods.line.update import factor_of
-from zakai.numerics.complex_step import STEP
+from zakai.numerics.complex_step import STEP, Number
 from zakai.numerics.line import window as lw
 from zakai.numerics.line.splitting import Interval, TangentCoefficients, through
 from zakai.numerics.line.steps import SPLIT
 from zakai.numerics.line.tangents import Varied, exponential_tangents, extended, resampled_tangents
 
-Array = Any
+Array = NDArray[Any]
 
 IN_TIME = "drifts", "outputs", "covariances", "precisions"
 
@@ -181,7 +182,8 @@ class _Walk:
 
     def _passed(self, prepared: Prepared, k: int, before: State, step: line_filter.SingleStep, observed: np.ndarray) -> None:
         """Take a single step whose transitions are known."""
-        density, own, gained = before.values, before.window, 0.0
+        density, own = before.values, before.window
+        gained: Number = 0.0
         for transition in step.transitions:
             self._regrid(density, own, transition.window)
             own = transition.after

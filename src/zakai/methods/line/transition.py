@@ -15,10 +15,12 @@ from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from zakai.methods.line.cache import Derived
 from zakai.methods.line.coefficients import (
     GROWTH,
+    Coefficients,
     coefficients,
     covariance_at,
     offset_of,
@@ -35,10 +37,11 @@ from zakai.methods.line.model import finite
 from zakai.methods.line.prepared import NOISE, Prepared, TimeInterval
 from zakai.methods.line.report import Report
 from zakai.methods.line.update import refitted
+from zakai.numerics.complex_step import Number
 from zakai.numerics.line import window as lw
 from zakai.numerics.line.averages import GAUSS_NODES, GAUSS_WEIGHTS
 from zakai.numerics.line.grid_choice import REACH
-from zakai.numerics.line.operator import FourierOperator, exponential_of
+from zakai.numerics.line.operator import FourierOperator, Generator, exponential_of
 from zakai.numerics.line.product import finer
 from zakai.numerics.line.resolution import (
     GROSS,
@@ -51,7 +54,7 @@ from zakai.numerics.line.resolution import (
     spectrum_bound,
 )
 
-Array = Any
+Array = NDArray[Any]
 
 CONTRACTED = -2.0  # f' times the length of an interval, below which other grids hold a density that becomes much sharper
 MOVING = 0.3  # ranges of a density that it moves in an interval without modes, above which grids move with it
@@ -89,8 +92,6 @@ def displaced(prepared: Prepared, values: Array, window: lw.Window, start: float
     return (float(result), float(growth)) if np.isfinite(result) else (0.0, 0.0)
 
 
-Coefficients = tuple[Array, Array, Array, Array]  # f (T, N), G (T,) or (T, N), V (T, N) and a constant (T,)
-
 PARTS = (1, 4, 16)  # of a substep with six nodes each, where the grid moves
 SMOOTHED = 100.0  # decay of the shortest wave of a large grid, as a logarithm, after which a coarser grid serves
 MAGNUS = 0.02  # of the tolerance that one substep of Magnus' series may leave
@@ -118,7 +119,7 @@ class Trial(NamedTuple):
     """
 
     values: Array
-    offset: Any
+    offset: Number
     error: float
     split: bool
     substep: Substep | None = None
@@ -128,9 +129,9 @@ class Trial(NamedTuple):
 class Exponents(NamedTuple):
     """The generators whose exponentials act in turn, each by its G, f and V, less an `offset` and a `constant` of V."""
 
-    generators: list[tuple[Any, Array, Array | None]]
+    generators: list[Generator]
     offset: float
-    constant: Any
+    constant: Number
     lift: float  # nats by which V is larger where there is no mass, infinite where G is negative
 
 
@@ -160,12 +161,12 @@ def exponents_of(prepared: Prepared, values: Array, window: lw.Window, substep: 
         return _of_magnus(prepared, values, averages, bool(substep.speed))
     known, length = tables(prepared, window), substep.length
     if not substep.inside.any():
-        return Exponents([(length * known.covariance, length * known.drift, None)], 0.0, 0.0, 0.0)
+        return Exponents([Generator(length * known.covariance, length * known.drift, np.zeros(window.size))], 0.0, 0.0, 0.0)
     precision = precision_of(prepared, substep.start, substep.inside)
     potential, constant = potential_of(known.observation, precision, substep.rates, values)
     potential = length * potential
     offset, lift = offset_of(potential, values)
-    generator = length * known.covariance, length * known.drift, potential - offset
+    generator = Generator(length * known.covariance, length * known.drift, potential - offset)
     return Exponents([generator], offset, length * constant, lift)
 
 
@@ -182,7 +183,8 @@ def _acted(
         matrices = [one.T for one in matrices[::-1]]
     if len(matrices) == 2:
         # The part of third order that two exponentials contain; they omit one of fifth order, with a factor that was measured.
-        difference = window.generator(*(late - early for early, late in zip(*exponents.generators, strict=True)))
+        early, late = exponents.generators
+        difference = window.generator(*(b - a for a, b in zip(early, late, strict=True)))
         (first, _), difference, now = matrices, difference.T if adjoint else difference, values.real
         commutator = 0.5 * (first @ (difference @ now) - difference @ (first @ now)).real
         error = 5.0 * float(np.sum(np.abs(commutator))) ** (5.0 / 3.0)
@@ -197,14 +199,11 @@ def _acted(
 
 
 class _Averages(NamedTuple):
-    """The nodes (T,) of a substep, their weights, and there f (T, N), G (T,) or (T, N), V (T, N) and the constant of V (T,)."""
+    """The nodes (T,) of a substep, their weights, and the coefficients there."""
 
     nodes: Array
     weights: Array
-    drift: Array
-    covariance: Array
-    potential: Array
-    constant: Array
+    coefficients: Coefficients
 
 
 def _at_points(prepared: Prepared, values: Array, window: lw.Window, substep: Substep) -> Callable[[Array], Coefficients]:
@@ -212,8 +211,8 @@ def _at_points(prepared: Prepared, values: Array, window: lw.Window, substep: Su
 
     def at(nodes: Array) -> Coefficients:
         times, shifts = substep.start + substep.length * nodes, substep.speed * substep.length * nodes if substep.speed else None
-        drift, *others = coefficients(prepared, window, times, substep.inside, substep.rates, values, shifts)
-        return drift - substep.speed, *others
+        known = coefficients(prepared, window, times, substep.inside, substep.rates, values, shifts)
+        return known._replace(drift=known.drift - substep.speed)
 
     return at
 
@@ -221,9 +220,9 @@ def _at_points(prepared: Prepared, values: Array, window: lw.Window, substep: Su
 def _averaged(substep: Substep, at: Callable[[Array], Coefficients], steady: bool = False) -> _Averages:
     if steady:  # one node serves
         middle = np.full(1, 0.5)
-        return _Averages(middle, np.full(1, substep.length), *at(middle))
+        return _Averages(middle, np.full(1, substep.length), at(middle))
     nodes = ((np.arange(substep.parts)[:, None] + GAUSS_NODES) / substep.parts).reshape(-1)
-    return _Averages(nodes, substep.length / substep.parts * np.tile(GAUSS_WEIGHTS, substep.parts), *at(nodes))
+    return _Averages(nodes, substep.length / substep.parts * np.tile(GAUSS_WEIGHTS, substep.parts), at(nodes))
 
 
 def _of_magnus(prepared: Prepared, values: Array, averages: _Averages, moving: bool) -> Exponents:
@@ -231,15 +230,16 @@ def _of_magnus(prepared: Prepared, values: Array, averages: _Averages, moving: b
 
     exp(B0 / 2 + 2 B1 / tau) exp(B0 / 2 - 2 B1 / tau),   B0 = int L dt,   B1 = int (t - middle) L dt.
     """
-    nodes, zeroth, drift, covariance, potential, constant = averages
+    nodes, zeroth, (drift, covariance, potential, constant) = averages
     offset, lift = offset_of(zeroth @ potential, values)
     if prepared.system.steady and not moving:
-        generator = zeroth @ covariance, zeroth @ drift, zeroth @ potential - offset
-        return Exponents([generator], offset, zeroth @ constant, lift)
+        generator = Generator(zeroth @ covariance, zeroth @ drift, zeroth @ potential - offset)
+        return Exponents([generator], offset, np.dot(zeroth, constant), lift)
     moment = 2.0 * zeroth * (nodes - 0.5)
-    halves = [(w @ covariance, w @ drift, w @ potential - 0.5 * offset) for w in (0.5 * zeroth - moment, 0.5 * zeroth + moment)]
-    lift = np.inf if any(np.any(half[0].real < 0) for half in halves) else lift
-    return Exponents(halves, offset, zeroth @ constant, lift)
+    weights = 0.5 * zeroth - moment, 0.5 * zeroth + moment
+    halves = [Generator(w @ covariance, w @ drift, w @ potential - 0.5 * offset) for w in weights]
+    lift = np.inf if any(np.any(half.covariance.real < 0) for half in halves) else lift
+    return Exponents(halves, offset, np.dot(zeroth, constant), lift)
 
 
 def magnus(
@@ -260,7 +260,8 @@ def magnus(
         substep = substep._replace(parts=parts)
         averages, error, length = _averaged(substep, at, not prepared.system.varying and not moving), 0.0, substep.length
         if moving:
-            error = _unresolved(window, values, length * averages.drift, length * averages.potential)
+            known = averages.coefficients
+            error = _unresolved(window, values, length * known.drift, length * known.potential)
         if error <= MAGNUS * prepared.tolerance:
             return _acted(prepared, values, window, substep, _of_magnus(prepared, values, averages, moving), adjoint, False)
     return Trial(values, 0.0, error, True)
@@ -308,10 +309,10 @@ class RecordedTransition(NamedTuple):
     values: Array
     window: lw.Window
     length: float
-    log_mass: Any
+    log_mass: Number
     after: lw.Window
     substep: Substep | None = None
-    offset: Any = 0.0
+    offset: Number = 0.0
     margins: tuple[int, int] = 0, 0
 
 
@@ -320,7 +321,7 @@ class Prediction(NamedTuple):
 
     values: Array
     window: lw.Window
-    gained: Any
+    gained: Number
     check: lw.GridCheck | None
     transitions: tuple[RecordedTransition, ...] = ()
 
@@ -387,7 +388,7 @@ def _by_substeps(
     """Return the same, and the logarithm of a bound on the growth of small values relative to the density."""
     system, negligible, check = prepared.system, prepared.negligible, None
     _, start, length, inside, rates = interval
-    gained: Any = 0.0
+    gained: Number = 0.0
     rough, resolved = noise_bound(prepared.tolerance), SPECTRUM_FACTOR * negligible
     report.positive = False
     bounds = [(0.0, length)]

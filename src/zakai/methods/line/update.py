@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from zakai.errors import InputError
 from zakai.methods.line.cache import Derived
@@ -15,8 +16,8 @@ from zakai.methods.line.model import System
 from zakai.methods.line.prepared import Prepared, State
 from zakai.methods.system.observation import log_likelihood
 from zakai.models.numeric import numpy_function
-from zakai.models.prior import DensityPrior
-from zakai.numerics.complex_step import log_determinant
+from zakai.models.prior import DensityPrior, Prior
+from zakai.numerics.complex_step import Number, log_determinant
 from zakai.numerics.line import window as lw
 from zakai.numerics.line.averages import GAUSS_NODES, GAUSS_WEIGHTS, panels
 from zakai.numerics.line.density import support
@@ -38,7 +39,7 @@ from zakai.numerics.line.resolution import RESOLVED, TRIALS
 from zakai.numerics.line.window import Window
 from zakai.numerics.prior_grid import mixture_log_density, prior_grid
 
-Array = Any
+Array = NDArray[Any]
 
 UNRESOLVED = 1e-6  # spectrum at the highest frequencies from which waves hide where a density ends, and a prior is averaged
 
@@ -109,20 +110,22 @@ def on_fitting_grid(
         most = large
 
 
-def outside_tables(prepared: Prepared, values: Array, window: lw.Window, t: float) -> float:
+def outside_tables(prepared: Prepared, values: Array, window: lw.Points, t: float) -> float:
     """Return the share of the mass where a table is constant beyond its range."""
     return float(values.real @ prepared.system.outside(window.points, t, prepared.theta) / np.sum(values.real))
 
 
-def state_moments(prepared: Prepared, values: Array, window: lw.Window, mean: Any, variance: Any) -> tuple[Any, Any]:
+def state_moments(
+    prepared: Prepared, values: Array, window: lw.Window, mean: Number, variance: Number
+) -> tuple[Number, Number]:
     """Return the mean and variance of the state from those of the variable of the grid, relative to its origin."""
     variable = variable_of(prepared.model)
     if variable is None:
         return window.origin + mean, variance
     offsets = variable.offset(window.points)
-    mean = offsets @ values
+    mean = np.dot(offsets, values)
     apart = offsets - mean
-    return variable.end + mean, (apart * apart) @ values
+    return variable.end + mean, np.dot(apart * apart, values)
 
 
 def edge_of_moments(prepared: Prepared, values: Array, window: lw.Window) -> float:
@@ -135,7 +138,7 @@ def edge_of_moments(prepared: Prepared, values: Array, window: lw.Window) -> flo
     return float(max(parts[0], parts[-1]) / np.sum(parts))
 
 
-def error_remainder(before: Any, predicted: Any, after: Any, spread: float) -> float:
+def error_remainder(before: Number, predicted: Number, after: Number, spread: float) -> float:
     """Return the remainder of an old relative error after a step, from the variances: that of an error of the mean in deviations.
 
     `spread` is the integral of G over the interval, which counts where the observation acts inside.
@@ -167,7 +170,7 @@ def factor_of(prepared: Prepared, k: int, observed: np.ndarray, window: lw.Windo
     return exponential_factor(prepared, k, observed) if prepared.lie and inside.any() else None
 
 
-def factor_at_end(prepared: Prepared, k: int, at_end: np.ndarray, observed: np.ndarray, window: lw.Window | None) -> Likelihood:
+def factor_at_end(prepared: Prepared, k: int, at_end: np.ndarray, observed: np.ndarray, window: lw.Points | None) -> Likelihood:
     """Return the likelihood of the samples, or of the increments that were gathered over more than the interval.
 
     `window` is a grid at which h is known where it does not depend on t.
@@ -228,15 +231,15 @@ def sampled_weakly(
     return Product(product, gained, depth, growth, window), check._replace(aliasing=error)
 
 
-def _sample_noise(prepared: Prepared, stop: float, at_end: np.ndarray) -> tuple[Array, Any]:
+def _sample_noise(prepared: Prepared, stop: float, at_end: np.ndarray) -> tuple[Array, Number]:
     """Return the precision of the observed coordinates of a sample, and the logarithm of the density's constant."""
     system, rows = prepared.system, np.flatnonzero(at_end)
 
-    def make() -> tuple[Array, Any]:
+    def make() -> tuple[Array, Number]:
         noise = system.noise(np.zeros(1), stop, prepared.theta)[np.ix_(rows, rows)]
         return np.linalg.inv(noise), -0.5 * (log_determinant(noise) + np.log(2 * np.pi) * len(rows))
 
-    result: tuple[Array, Any] = prepared.once(Derived.SAMPLE_NOISE, at_end.tobytes(), make) if system.steady_noise else make()
+    result: tuple[Array, Number] = prepared.once(Derived.SAMPLE_NOISE, at_end.tobytes(), make) if system.steady_noise else make()
     return result
 
 
@@ -255,7 +258,7 @@ def shared_noise(system: System, theta: np.ndarray, stop: float, spans: np.ndarr
     """Return the covariance of increments that end together: the integral of S over the time that two have in common."""
     common = np.minimum(spans[:, None], spans)
     if system.steady_noise:
-        return system.noise(np.zeros(1), stop, theta)[np.ix_(rows, rows)] * common
+        return np.asarray(system.noise(np.zeros(1), stop, theta)[np.ix_(rows, rows)] * common)
     total = np.zeros((len(rows), len(rows)), complex if np.iscomplexobj(theta) else float)
     for span in np.unique(spans):
         pieces = panels(lambda t: system.noise(np.zeros((len(t), 1)), t, theta.real).reshape(len(t), -1), stop - span, stop)
@@ -290,7 +293,7 @@ def state_of(values: Array, window: lw.Window, error: float, log_floor: float) -
     return State(values, window.origin, window.centre, window.spacing, window.unit, window.closed, error, log_floor)
 
 
-def init(prepared: Prepared, prior: Any) -> State:
+def init(prepared: Prepared, prior: Prior) -> State:
     """Return the prior on a grid that fits it."""
     model, closed, variable = prepared.model, bool(prepared.model.periodic), variable_of(prepared.model)
     if isinstance(prior, DensityPrior):
@@ -316,7 +319,7 @@ def init(prepared: Prepared, prior: Any) -> State:
 
         def evaluate(points: Array) -> Array:
             with np.errstate(all="ignore"):
-                return of_state(points) + variable.log_slope(points)[..., 0]
+                return np.asarray(of_state(points) + variable.log_slope(points)[..., 0])
 
     cut = lw.CUT if variable is None else CUT_OF_DOMAIN
     if log_density is None:

@@ -8,9 +8,10 @@ steps are refined until the result settles.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from zakai.methods.line.coefficients import coefficients, covariance_at, resolved_parts
 from zakai.methods.line.domain import ends_of_leak
@@ -18,13 +19,14 @@ from zakai.methods.line.model import finite, within
 from zakai.methods.line.prepared import Prepared, TimeInterval
 from zakai.methods.line.report import Report
 from zakai.methods.line.transition import Prediction
+from zakai.numerics.complex_step import Number
 from zakai.numerics.line import window as lw
 from zakai.numerics.line.averages import GAUSS_NODES, Panels, interpolation
 from zakai.numerics.line.resolution import RESOLVED, ROUNDING, SUPPORT, TRANSITION_SHARE
 from zakai.numerics.line.volumes import Bands, Volumes, advanced, ends_of_steps, volumes
 from zakai.numerics.line.window import local_polynomial
 
-Array = Any
+Array = NDArray[Any]
 
 FAST = 5.0  # ranges of a density that the drift crosses in an interval, below which it is not followed
 LEVELS = ((256, 24), (512, 34), (1024, 48), (2048, 68), (4096, 96), (8192, 136), (16384, 192))  # cells and steps
@@ -66,7 +68,7 @@ class CellPlan(NamedTuple):
 
 
 def cell_plan_of(
-    prepared: Prepared, values: Array, window: lw.Window, ends: Array, interval: TimeInterval,
+    prepared: Prepared, values: Array, window: lw.Points, ends: Array, interval: TimeInterval,
     aim: tuple[float, float] = (0.0, np.inf), widening: float = np.inf,
 ) -> CellPlan | None:  # fmt: skip
     """Return the plan of cells for a density between two offsets, None where the drift leads beyond all numbers.
@@ -140,7 +142,7 @@ def ends_of(values: Array, window: lw.Window) -> Array:
     return window.offsets[[max(check.first - 1, 0), min(check.last + 1, window.size - 1)]]
 
 
-def drift_along(prepared: Prepared, window: lw.Window, offsets: Array, t: float) -> Array:
+def drift_along(prepared: Prepared, window: lw.Points, offsets: Array, t: float) -> Array:
     """Return f at offsets from the origin (J,)."""
     return finite(prepared.system.drift(window.origin + offsets[:, None], t, prepared.theta.real)[:, 0])
 
@@ -182,7 +184,7 @@ class FlowSummary(NamedTuple):
     high: float
 
 
-def _flow_summary(prepared: Prepared, window: lw.Window, ends: Array, start: float, steps: Array) -> FlowSummary:
+def _flow_summary(prepared: Prepared, window: lw.Points, ends: Array, start: float, steps: Array) -> FlowSummary:
     """Follow Gaussian parts of a density between two offsets by exponential Euler steps."""
     count, width = _FLOW_POINTS, float(ends[1] - ends[0])
     x, t, travel, most = np.linspace(float(ends[0]), float(ends[1]), count), start, 0.0, 0.0
@@ -290,7 +292,7 @@ class Settled(NamedTuple):
 
     values: Array
     cells: Volumes
-    log_scale: Any
+    log_scale: Number
     error: float
 
 
@@ -311,13 +313,13 @@ def advanced_by(
         allowed: the error at which more cells are not tried.
     """
 
-    def at_level(cells: Volumes, steps: Array) -> tuple[Array, Any]:
+    def at_level(cells: Volumes, steps: Array) -> tuple[Array, Number]:
         before = density(cells.offsets)
         masses = before * cells.widths
         return _advanced(masses / np.sum(masses), prepared, before, cells, interval, steps, plan)
 
     def summed(masses: Array) -> Array:
-        return masses.reshape(-1, 2).sum(axis=1)
+        return np.asarray(masses.reshape(-1, 2).sum(axis=1))
 
     return _settled(allowed, plan, at_level, summed, lambda cells: np.ones(cells.size))
 
@@ -356,7 +358,7 @@ def pulled_back(
     if plan is None:
         return None
 
-    def at_level(cells: Volumes, steps: Array) -> tuple[Array, Any]:
+    def at_level(cells: Volumes, steps: Array) -> tuple[Array, Number]:
         logs = log_values(cells.offsets)
         top = float(np.max(logs))
         before = density(cells.offsets)
@@ -365,16 +367,18 @@ def pulled_back(
 
     def between(result: Array) -> Array:
         padded = np.concatenate([result[:1], result, result[-1:]])
-        return (9.0 * (result[::2] + result[1::2]) - padded[:-2:2] - padded[3::2]) / 16.0
+        return np.asarray((9.0 * (result[::2] + result[1::2]) - padded[:-2:2] - padded[3::2]) / 16.0)
 
     result = _settled(SMOOTH, plan, at_level, between, lambda cells: density(cells.offsets) * cells.widths)
-    return None if result is None else BackwardExpectation(result.cells, result.values, float(result.log_scale), result.error)
+    if result is None:
+        return None
+    return BackwardExpectation(result.cells, result.values, float(result.log_scale.real), result.error)
 
 
 def _settled(
     allowed: float,
     plan: CellPlan,
-    at_level: Callable[[Volumes, Array], tuple[Array, Any]],
+    at_level: Callable[[Volumes, Array], tuple[Array, Number]],
     paired: Callable[[Array], Array],
     weights: Callable[[Volumes], Array],
 ) -> Settled | None:
@@ -419,13 +423,13 @@ def _advanced(
     ends: Array,
     plan: CellPlan,
     backward: bool = False,
-) -> tuple[Array, Any]:
+) -> tuple[Array, Number]:
     """Return the masses of cells after steps, and the logarithm of their sum; `density` is the one before the interval."""
-    at, bounds, (_, start, _, inside, rates) = cast(lw.Window, cells), plan.bounds, interval  # by its points
+    bounds, (_, start, _, inside, rates) = plan.bounds, interval
     known: dict[int, Bands] = {}
 
     def operators(times: Array) -> Bands:
-        drift, covariance, potential, constant = coefficients(prepared, at, times, inside, rates, density)
+        drift, covariance, potential, constant = coefficients(prepared, cells, times, inside, rates, density)
         drift = np.where(np.abs(drift) < plan.fastest, drift, plan.fastest * np.sign(drift.real))
         covariance = covariance if covariance.ndim == 2 else covariance[:, None]
         return cells.bands(covariance, drift, potential + constant[:, None] - offset)
@@ -444,7 +448,7 @@ def _advanced(
 
     offset = 0.0
     if inside.any():
-        *_, potential, constant = coefficients(prepared, at, np.array([start]), inside, rates, density)
+        *_, potential, constant = coefficients(prepared, cells, np.array([start]), inside, rates, density)
         counts = density.real > 1e-6 * density.real.max()
         offset = float(np.max(potential[0, : cells.size][counts].real) + constant[0].real)
     masses, gained = advanced(bands, masses, ends, backward)

@@ -11,6 +11,7 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from zakai.methods.yau.kernel import PowerSeries
 from zakai.methods.yau.system import YauSystem
@@ -18,7 +19,7 @@ from zakai.models.kept import once_for_a_model
 from zakai.models.model import Model
 from zakai.numerics.flow import FlowResult, Transition, integrate
 
-Array = Any
+Array = NDArray[Any]
 
 UNRESOLVED = 1e-10  # relative error of a transition from which the coefficients in time are not resolved
 

@@ -15,6 +15,7 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from zakai.densities import IntervalDensity
 from zakai.methods._protocol import Backward, Info
@@ -42,6 +43,7 @@ from zakai.methods.reflecting.elements import (
     weighted,
 )
 from zakai.methods.reflecting.filter import State
+from zakai.numerics.complex_step import Number
 from zakai.numerics.line import window as lw
 from zakai.numerics.line.backward import ROUNDING
 from zakai.numerics.line.density import support
@@ -49,7 +51,7 @@ from zakai.numerics.line.resolution import ROUNDING as PRECISION
 from zakai.numerics.line.resolution import SMOOTHER_SHARE, SUPPORT
 from zakai.numerics.lobatto import Element
 
-Array = Any
+Array = NDArray[Any]
 
 PIECE = 10.0  # standard deviations of the noise in which states at the end share a transition
 RESOLVING = 3.7  # points in a standard deviation
@@ -70,7 +72,7 @@ def draw(
     element, middle, theta = state.element, start + 0.5 * length, prepared.theta.real
     x = element.points
     drift = prepared.system.drift(x[:, None], middle, theta)[:, 0]
-    G = covariance_at(prepared.system, x, np.asarray(middle), theta) * np.ones(len(x))
+    G = covariance_at(prepared.system, x, middle, theta) * np.ones(len(x))
     slope = float(np.max(np.abs(element.derivative(drift))))
     deviation = float(np.sqrt(np.min(G) * min(length, 0.5 / max(slope, 1e-300))))
     wide = SUPPORT * float(np.sqrt(np.max(G) * length))
@@ -110,7 +112,7 @@ def _transition(prepared: Prepared, k: int, piece: Element, before: Array, obser
     _, start, length, inside, rates = interval
     bounds, result = [(0.0, length)], np.eye(len(piece.points))
     if prepared.system.varying:
-        parts = resolved_parts(prepared, before, piece, interval).bounds  # type: ignore[arg-type]  # by its points
+        parts = resolved_parts(prepared, before, piece, interval).bounds
         cuts = [np.linspace(*part, SUBSTEPS + 1) for part in parts]
         bounds = [(float(a), float(b)) for cut in cuts for a, b in zip(cut[:-1], cut[1:], strict=True)]
     for first, last in bounds:
@@ -118,7 +120,7 @@ def _transition(prepared: Prepared, k: int, piece: Element, before: Array, obser
         known = operator_at(prepared, piece, float(middle[0]))
         if known is None:
             return np.full_like(result, np.nan)
-        _, _, potential, _ = coefficients(prepared, piece, middle, inside, rates, before)  # type: ignore[arg-type]
+        _, _, potential, _ = coefficients(prepared, piece, middle, inside, rates, before)
         modes = known.weighted(potential[0]) if inside.any() else known.modes
         s = modes.scale[:, None]
         result = s * modes.decayed(result / s, last - first)
@@ -179,7 +181,7 @@ def smoothed(prepared: Prepared, state: State, later: Message) -> tuple[Message,
         "edge_mass": max(reached(values, element, domain_of(prepared))),
         "negative_mass": float(-np.minimum(values, 0.0).sum()),
         "aliasing": element.unresolved(values),
-        "std_in_spacings": float(np.sqrt(max(variance, 0.0))) / element.spacing,
+        "std_in_spacings": float(np.sqrt(max(variance.real, 0.0))) / element.spacing,
     }
     density = values / element.weights
     first, last = element.points[list(support(density, negligible(prepared)))] - later.origin
@@ -217,14 +219,15 @@ def _by_modes(
     """
     _, start, length, inside, _ = interval
     own, values = state.element, np.asarray(state.values).real
-    G = covariance_at(prepared.system, own.points, np.asarray(start), prepared.theta.real)
+    G = covariance_at(prepared.system, own.points, start, prepared.theta.real)
     reach = MODES_REACH * float(np.sqrt(np.max(G) * length))
     domain = domain_of(prepared)
     low, high = np.clip([later.origin + end for end in later.ends], domain.lower, domain.upper).tolist()
     lower, upper = apart(min(own.lower, low) - reach, max(own.upper, high) + reach, domain)
     after = element_of(prepared, low, high, QUADRATURE)
     logs = later.at(after.points - later.origin)
-    top, constant = float(np.max(logs)), 0.0
+    top = float(np.max(logs))
+    constant: Number = 0.0
     weights = after.weights * np.exp(logs - top)
     for size in SIZES[1:]:
         element = element_of(prepared, lower, upper, size)
@@ -251,7 +254,7 @@ def _by_modes(
         at = element.interpolation(x)
         return (at @ scaled) * np.exp(at @ log_s)
 
-    return _on(prepared, state, expectation, top + constant, error)
+    return _on(prepared, state, expectation, top + float(constant.real), error)
 
 
 def _by_volumes(
@@ -262,7 +265,7 @@ def _by_volumes(
     ends, (mean, variance) = np.array([0.0, element.upper - element.lower]), later.moments
     shift = element.lower - later.origin
     aim = mean - shift, variance**0.5
-    plan = cell_plan_of(prepared, values, element, ends, interval, aim)  # type: ignore[arg-type]  # by its points
+    plan = cell_plan_of(prepared, values, element, ends, interval, aim)
     result = pulled_back(
         prepared, lambda x: later.at(x + shift), lambda x: element.at(values, element.lower + x), plan, interval
     )

@@ -14,6 +14,7 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from zakai.errors import InputError
 from zakai.methods.line.cache import Derived
@@ -22,13 +23,14 @@ from zakai.methods.line.prepared import Prepared, TimeInterval
 from zakai.methods.line.report import Report
 from zakai.methods.line.volumes import advanced_by, cell_plan_of, kinks_between
 from zakai.models.domain import Interval
+from zakai.numerics.complex_step import Number
 from zakai.numerics.line.averages import GAUSS_NODES, GAUSS_WEIGHTS
 from zakai.numerics.line.grid_choice import DEPTH, WIDENING
 from zakai.numerics.line.operator import Spectral
 from zakai.numerics.line.resolution import RESOLVED, TRANSITION_SHARE, rounding_bound
 from zakai.numerics.lobatto import Element
 
-Array = Any
+Array = NDArray[Any]
 
 SIZES = (24, 32, 48, 64, 96, 128, 192, 256)
 SIZES_OF_PRIORS = (*SIZES, 512, 1024)  # of which no operator is decomposed
@@ -157,12 +159,12 @@ def decomposed(prepared: Prepared, element: Element) -> Operator | None:
 def operator_at(prepared: Prepared, element: Element, t: float) -> Operator | None:
     """Return the operator on an element at a time and its decomposition; None where there is none."""
     system, theta, x = prepared.system, prepared.theta, element.points
-    G = covariance_at(system, x, np.asarray(t), theta) * np.ones(len(x))
+    G = covariance_at(system, x, t, theta) * np.ones(len(x))
     if not (G.real > 0).all():
         return None
     drift, steps = system.drift(x[:, None], t, theta)[:, 0], np.diff(x)
     nodes = (x[:-1, None] + steps[:, None] * GAUSS_NODES).reshape(-1)
-    slopes = system.drift(nodes[:, None], t, theta)[:, 0] / covariance_at(system, nodes, np.asarray(t), theta)
+    slopes = system.drift(nodes[:, None], t, theta)[:, 0] / covariance_at(system, nodes, t, theta)
     gauge = np.concatenate([np.zeros(1), np.cumsum(steps * (slopes.reshape(len(steps), -1) @ GAUSS_WEIGHTS))])
     logs = gauge - 0.5 * np.log(G)
     if not np.isfinite(logs.real).all() or not np.isfinite(drift.real).all():
@@ -174,10 +176,10 @@ def operator_at(prepared: Prepared, element: Element, t: float) -> Operator | No
 
 def weighted(
     prepared: Prepared, known: Operator, element: Element, interval: TimeInterval, values: Array
-) -> tuple[Spectral, Array, Any]:
+) -> tuple[Spectral, Array, Number]:
     """Return the modes with the potential of increments less a number, its integral over time, and that of the number."""
     _, start, length, inside, rates = interval
-    h, precision = tables(prepared, element).observation, precision_of(prepared, start, inside)  # type: ignore[arg-type]
+    h, precision = tables(prepared, element).observation, precision_of(prepared, start, inside)
     potential, constant = potential_of(h, precision, rates, values)
     offset, _ = offset_of(length * potential, values)
     return known.weighted(potential - offset / length), length * (potential + constant), offset + length * constant
@@ -187,10 +189,10 @@ def logarithm(values: Array) -> Array:
     return np.log(np.maximum(values, 1e-300))
 
 
-def moments(values: Array, element: Element) -> tuple[Any, Any]:
+def moments(values: Array, element: Element) -> tuple[Number, Number]:
     x = element.points - element.lower
-    mean = x @ values
-    return element.lower + mean, ((x - mean) ** 2) @ values
+    mean = np.dot(x, values)
+    return element.lower + mean, np.dot((x - mean) ** 2, values)
 
 
 COUNTS = 1e-14  # density relative to the maximum beyond which it is rounding
@@ -202,7 +204,7 @@ PEAK = 1.5  # points in a standard deviation of the noise with which the first e
 
 def propagated(
     prepared: Prepared, values: Array, element: Element, interval: TimeInterval, report: Report, negligible: float
-) -> tuple[Array, Element, Any]:
+) -> tuple[Array, Element, Number]:
     """Return the density after an interval, its points, and the logarithm of its mass."""
     arguments = prepared, values, element, interval, report, negligible
     result = None if prepared.system.varying else _by_modes(*arguments)
@@ -217,7 +219,7 @@ def propagated(
 
 def _by_modes(
     prepared: Prepared, values: Array, element: Element, interval: TimeInterval, report: Report, negligible: float
-) -> tuple[Array, Element, Any] | None:
+) -> tuple[Array, Element, Number] | None:
     """Return the density after an interval, its points, and the logarithm of its mass; None where modes do not serve."""
     domain, allowed = domain_of(prepared), rounding_bound(prepared.tolerance)
     _, start, length, inside, _ = interval
@@ -230,7 +232,8 @@ def _by_modes(
     needed = min(2.0 * PEAK * longest / max(noise[0], 1e-300), element.size * longest / float(np.max(element.halves)))
     size = next((size for size in SIZES if size >= min(needed, SIZES[4])), SIZES[-1])
     for _ in range(TRIALS):
-        new, offset = element_of(prepared, lower, upper, size), 0.0
+        new = element_of(prepared, lower, upper, size)
+        offset: Number = 0.0
         known = decomposed(prepared, new)
         if known is None:
             return None
@@ -282,7 +285,7 @@ def _projected(values: Array, element: Element, new: Element, known: Operator, n
 
 def _by_volumes(
     prepared: Prepared, values: Array, element: Element, interval: TimeInterval, report: Report, negligible: float
-) -> tuple[Array, Element, Any]:
+) -> tuple[Array, Element, Number]:
     """Return the density after an interval, its points, and the logarithm of its mass, in parts where volumes do not settle."""
     stack, gained, count = [(0.0, interval.length)], 0.0 * values[0], 0
     while stack:
@@ -303,7 +306,7 @@ def _by_volumes(
 
 def _part(
     prepared: Prepared, values: Array, element: Element, interval: TimeInterval, report: Report, negligible: float
-) -> tuple[Array, Element, Any] | None:
+) -> tuple[Array, Element, Number] | None:
     """Return the density after a part of an interval from finite volumes, None where these do not settle."""
     domain, at = domain_of(prepared), element
 
@@ -311,7 +314,7 @@ def _part(
         return at.at(values, at.lower + offsets)
 
     ends = np.array([0.0, at.upper - at.lower])
-    plan = cell_plan_of(prepared, values, at, ends, interval)  # type: ignore[arg-type]  # by its points
+    plan = cell_plan_of(prepared, values, at, ends, interval)
     if plan is None:
         return None
     result = advanced_by(prepared, before, plan, interval, TRANSITION_SHARE * prepared.tolerance)

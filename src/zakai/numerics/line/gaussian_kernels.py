@@ -21,6 +21,7 @@ from numba import complex128, float64, int64
 from numpy.typing import NDArray
 
 from zakai.numerics.compiled import helper, kernel
+from zakai.numerics.complex_step import Number
 from zakai.numerics.exponentials import exponentiate
 from zakai.numerics.line.density import highest_of
 from zakai.numerics.line.steps import Transition, failed
@@ -31,12 +32,12 @@ Array = NDArray[Any]
 class Channel(NamedTuple):
     """The kernel for given inputs: a, b, V, k0, k1, k2."""
 
-    scale: Any
-    shift: Any
-    variance: Any
-    constant: Any
-    slope: Any
-    curvature: Any
+    scale: Number
+    shift: Number
+    variance: Number
+    constant: Number
+    slope: Number
+    curvature: Number
 
 
 def chosen(transitions: LinearTransition, k: int, inputs: Array) -> Channel:
@@ -280,7 +281,7 @@ _APPLIED = [
 
 @kernel(*_APPLIED)
 def applied(
-    sources: Array, first: float, spacing: float, size: int, weights: Array, scale: Any, shift: Any, variance: Any
+    sources: Array, first: float, spacing: float, size: int, weights: Array, scale: Number, shift: Number, variance: Number
 ) -> Array:
     """Return sum_j N(x_i; scale y_j + shift, variance) weights_j at x_i = first + spacing i, i = 0 .. size - 1, by recurrence."""
     result = np.zeros(size, weights.dtype)

@@ -21,6 +21,7 @@ from numba import float64, int64, types, void
 from numpy.typing import NDArray
 
 from zakai.numerics.compiled import kernel
+from zakai.numerics.complex_step import Number
 from zakai.numerics.line import window as lw
 from zakai.numerics.line.density import moments, support
 from zakai.numerics.line.grid_choice import DEPTH, LEVELS, MOST_CELLS
@@ -42,9 +43,9 @@ class Gaussian:
     observation: Callable[[Array], Array]
     value: Array
     precision: Array
-    constant: Any
+    constant: Number
     linear: bool = False
-    known: tuple[lw.Window, Array] | None = None  # h at the points of a grid
+    known: tuple[lw.Points, Array] | None = None  # h at the points of a grid
 
     def logs(self, points: Array) -> Array:
         """Return log l (J,), minus infinity where h has no value."""
@@ -84,7 +85,7 @@ class Product(NamedTuple):
     """
 
     values: Array
-    log_mass: Any
+    log_mass: Number
     depth: float
     growth: float
     window: lw.Window
@@ -147,7 +148,7 @@ def _product(values: Array, window: lw.Window, new_values: Array, new: lw.Window
     return Product(*normalized(new_values, logs, np.ones(new.size), top_of_density), new)
 
 
-def normalized(density: Array, logs: Array, weights: Array, largest: float) -> tuple[Array, Any, float, float]:
+def normalized(density: Array, logs: Array, weights: Array, largest: float) -> tuple[Array, Number, float, float]:
     """Return the product of a density and a likelihood as probabilities.
 
     Args:
@@ -162,7 +163,7 @@ def normalized(density: Array, logs: Array, weights: Array, largest: float) -> t
     """
     if np.iscomplexobj(logs) or np.iscomplexobj(density):
         logs, density = logs.astype(complex), density.astype(complex)
-    result: tuple[Array, Any, float, float] = _normalized(*map(np.ascontiguousarray, (density, logs, weights)), largest)
+    result: tuple[Array, Number, float, float] = _normalized(*map(np.ascontiguousarray, (density, logs, weights)), largest)
     return result
 
 
@@ -173,7 +174,7 @@ _R, _C = types.float64, types.complex128
     types.Tuple((_R[::1], _R, _R, _R))(_R[::1], _R[::1], _R[::1], _R),  # type: ignore[no-untyped-call]
     types.Tuple((_C[::1], _C, _R, _R))(_C[::1], _C[::1], _R[::1], _R),  # type: ignore[no-untyped-call]
 )
-def _normalized(values: Array, logs: Array, weights: Array, largest: float) -> tuple[Array, Any, float, float]:
+def _normalized(values: Array, logs: Array, weights: Array, largest: float) -> tuple[Array, Number, float, float]:
     size = values.size
     result = np.zeros(size, values.dtype)
     own = np.empty(size)

@@ -19,6 +19,7 @@ from numba import complex128, float64, int64
 from numpy.typing import NDArray
 
 from zakai.numerics.compiled import helper, kernel
+from zakai.numerics.complex_step import Number
 from zakai.numerics.line import window as lw
 from zakai.numerics.line.window import interpolated_logs
 
@@ -164,7 +165,7 @@ def ends_of_steps(length: float, first: float, count: int) -> Array:
     return np.concatenate([[0.0], first * (length / first) ** np.linspace(0.0, 1.0, count)])
 
 
-def advanced(bands: Callable[[Array], Bands], values: Array, ends: Array, backward: bool = False) -> tuple[Array, Any]:
+def advanced(bands: Callable[[Array], Bands], values: Array, ends: Array, backward: bool = False) -> tuple[Array, Number]:
     """Return the masses after steps, with the sum one, and the logarithm of their sum before.
 
     Args:
@@ -174,7 +175,7 @@ def advanced(bands: Callable[[Array], Bands], values: Array, ends: Array, backwa
         ends: the ends of the steps (T + 1,), with the start.
         backward: whether to take the adjoint.
     """
-    gained: Any = 0.0
+    gained: Number = 0.0
     steps = list(zip(ends[:-1], ends[1:], strict=True))
     for start, stop in steps[::-1] if backward else steps:
         below, diagonal, above = bands(start + (stop - start) * _TIMES)

@@ -9,7 +9,7 @@ rounding.  Logarithms and messages are interpolated by polynomials through the n
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -68,6 +68,25 @@ TOGETHER = 256  # points at which values of a large grid are interpolated togeth
 ALIGNMENT = 8  # centres are at multiples of so many spacings
 
 
+class Points(Protocol):
+    """Points that carry a density: those of a uniform grid, of cells, or of Gauss-Lobatto elements."""
+
+    @property
+    def origin(self) -> float:
+        """The state from which offsets count."""
+
+    @property
+    def closed(self) -> bool:
+        """Whether they go once around the circle."""
+
+    @property
+    def points(self) -> Array:
+        """The points, first those that carry probabilities."""
+
+    def __hash__(self) -> int:
+        """Equal points have equal tables."""
+
+
 class Window(NamedTuple):
     """The grid x_i = origin + centre + spacing (i - size // 2), i = 0 .. size - 1; `closed` if it goes once around the circle.
 
@@ -91,10 +110,10 @@ class Window(NamedTuple):
         """The points (size,)."""
         return self.origin + self.offsets
 
-    def generator(self, covariance: Any, drift: Array, potential: Array | None = None) -> Operator:
+    def generator(self, covariance: Array, drift: Array, potential: Array) -> Operator:
         """Return the Kolmogorov operator L for G, f and V at the points, or integrals over time of these."""
         if self.size > LARGEST:
-            return FourierOperator(covariance, drift, 0.0 if potential is None else potential, self.spacing * self.size)
+            return FourierOperator(covariance, drift, potential, self.spacing * self.size)
         return generator(self.closed, self.spacing, covariance, drift, potential)
 
 
