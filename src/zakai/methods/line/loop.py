@@ -1,4 +1,4 @@
-"""Many steps of one-state filters in one compiled loop (`numerics/line/loop.py`, `numerics/line/modes.py`).
+"""Many steps of one-state filters in one compiled loop (`numerics/line/loop.py`, `numerics/line/modes_loop.py`).
 
 An interval that the loop refuses (an error above the tolerance, a gap in a path) is filtered by `single` of `line/filter.py`.
 `step` of that file asks this loop for its one interval first: whether steps are taken one by one or together makes no difference.
@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from zakai.methods._protocol import Info, Infos
+from zakai.methods._protocol import Info, Infos, joined
 from zakai.methods._states import Joined, StackedStates
 from zakai.methods.line import modal
 from zakai.methods.line.cache import Derived
@@ -23,7 +23,7 @@ from zakai.numerics.line import window as lw
 from zakai.numerics.line.averages import GAUSS_NODES, parts_needed, probed
 from zakai.numerics.line.gaussian_kernels import BAND
 from zakai.numerics.line.loop import advance
-from zakai.numerics.line.modes import OWN, PLACE, STAY
+from zakai.numerics.line.modes_loop import OWN, PLACE, STAY
 from zakai.numerics.line.product import at_nodes, nodes
 from zakai.numerics.line.resolution import TRIALS
 from zakai.numerics.line.steps import (
@@ -185,7 +185,7 @@ class Piece(NamedTuple):
         """Return steps after which the grid stays."""
         error, log_floor = float(reports[-1, ERROR]), float(reports[-1, FLOOR])
         centre, spacing = float(centres[-1]), float(spacings[-1])
-        last = State(densities[-1], before.origin, centre, spacing, before.unit, before.closed, error, log_floor)
+        last = before._replace(values=densities[-1], centre=centre, spacing=spacing, error=error, log_floor=log_floor)
         return cls(first, before, densities, centres, spacings, reports, last)
 
 
@@ -265,13 +265,6 @@ def _piece(first: int, before: State, start: int, segment: Segment) -> Piece:
     spacing = before.spacing
     centres = spacing * (round(before.centre / spacing) + (segment.reports[:, START] - start))
     return Piece.of(first, before, segment.densities, centres, np.full(len(centres), spacing), segment.reports)
-
-
-def joined(parts: list[Infos]) -> Infos:
-    """Return the reports of consecutive steps as one."""
-    health = {name: np.concatenate([part.health[name] for part in parts]) for name in parts[0].health}
-    increments, means, covs = (np.concatenate([part[i] for part in parts]) for i in range(3))
-    return Infos(increments, means, covs, health)
 
 
 def _covering(prepared: Prepared, state: State, low: float, high: float, spacing: float) -> State | None:

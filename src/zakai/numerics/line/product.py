@@ -352,11 +352,11 @@ def weaken(fine: Array, start: int, precision: Array, observed: Array, centre: A
 
 
 @kernel(float64(_V, _V))
-def weak_error(now: Array, change: Array) -> float:
+def weak_error(density: Array, change: Array) -> float:
     """Return the change of mass, mean and variance, in deviations, by relative changes of a density."""
-    mean, variance = moments(now)[1:]
+    mean, variance = moments(density)[1:]
     mass, first, second = 0.0, 0.0, 0.0
-    for j in range(now.size):
-        at, part = (j - now.size // 2 - mean) / np.sqrt(variance), now[j] * change[j]
+    for j in range(density.size):
+        at, part = (j - density.size // 2 - mean) / np.sqrt(variance), density[j] * change[j]
         mass, first, second = mass + part, first + part * at, second + part * (at * at - 1.0)
     return abs(mass) + abs(first) + abs(second)

@@ -197,7 +197,7 @@ def fitted(check: GridCheck, window: Window, most: int = LARGEST, generous: int 
     """Return the grid to go on with: the same where it serves, else one that fits the density.
 
     Args:
-        look: the figures of the density.
+        check: the figures of the density.
         window: its grid.
         most: the largest size.
         generous: a grid of up to so many points is kept though fewer would do.
