@@ -14,11 +14,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from zakai.methods.line.coefficients import on_grid_for_drift
+from zakai.methods.line.coefficients import on_grid_for_drift, travel
 from zakai.methods.line.kernel import by_kernel, kernel_of
 from zakai.methods.line.prepared import Prepared, TimeInterval
 from zakai.methods.line.report import Report
-from zakai.methods.line.transition import MOVING, Prediction, by_decomposition, by_substeps, travel
+from zakai.methods.line.transition import Prediction, by_decomposition, by_substeps
 from zakai.methods.line.update import refitted
 from zakai.methods.line.volumes import contracted
 from zakai.numerics.line import window as lw
@@ -26,6 +26,9 @@ from zakai.numerics.line.gaussian_kernels import Channel
 from zakai.numerics.line.grid_choice import FAR
 
 Array = NDArray[Any]
+
+
+MOVING = 0.3  # ranges of a density that it moves in an interval without modes, above which grids move with it
 
 
 @dataclass

@@ -23,7 +23,7 @@ from zakai.methods.line.prepared import Prepared, TimeInterval
 from zakai.numerics.complex_step import Number
 from zakai.numerics.line import window as lw
 from zakai.numerics.line.averages import GAUSS_NODES, GAUSS_WEIGHTS, Panels, panels
-from zakai.numerics.line.grid_choice import PER, PROFILE
+from zakai.numerics.line.grid_choice import PER, PROFILE, REACH
 from zakai.numerics.line.operator import Spectral, symmetric
 from zakai.numerics.line.product import PARTS, at_nodes, nodes, weak
 
@@ -351,3 +351,38 @@ def _hidden(prepared: Prepared, window: lw.Window, start: float) -> tuple[Array,
         return make()
     pair: tuple[Array, Array] = prepared.once(Derived.HIDDEN_DRIFT, window, make)
     return pair
+
+
+CONTRACTED = -2.0  # f' times the length of an interval, below which other grids hold a density that becomes much sharper
+
+
+def travel(prepared: Prepared, values: Array, window: lw.Window, start: float, length: float) -> float:
+    """Return by how many of its ranges the drift moves a density in an interval, zero where grids do not move with it.
+
+    They do not where noise moves the state as far, or the density becomes much sharper.
+    """
+    system = prepared.system
+    if window.closed or prepared.kinked or system.kinks is not None or system.cross is not None or system.reflecting:
+        return 0.0
+    check, (carried, growth) = lw.grid_check(values, False), displaced(prepared, values, window, start, length)
+    G = covariance_at(system, window.points[[check.first, check.last]], start, prepared.theta.real)
+    noise = float(np.sqrt(np.max(G.real) * length))
+    if growth < CONTRACTED or abs(carried) < noise:
+        return 0.0
+    return abs(carried) / (window.spacing * (check.last - check.first + 1) + 2.0 * REACH * noise)
+
+
+def speed_of(prepared: Prepared, values: Array, window: lw.Window, start: float, length: float) -> float:
+    """Return the speed with which a grid follows a density in a substep: a whole number of its spacings in that time."""
+    carried, _ = displaced(prepared, values, window, start, length)
+    return window.spacing * float(np.round(carried / window.spacing)) / length
+
+
+def displaced(prepared: Prepared, values: Array, window: lw.Window, start: float, length: float) -> tuple[float, float]:
+    """Return about how far the drift carries the mean of a density, by its linearisation there, and f' times the length."""
+    mean, variance = lw.moments(values, window)
+    x = window.origin + float(mean.real) + float(np.sqrt(variance.real)) * np.array([0.0, -0.1, 0.1])
+    here, below, above = finite(prepared.system.drift(x[:, None], start, prepared.theta.real)[:, 0]).tolist()
+    growth = length * (above - below) / (x[2] - x[1])
+    result = length * here * (np.expm1(min(growth, 3.0)) / growth if abs(growth) > 1e-8 else 1.0)
+    return (float(result), float(growth)) if np.isfinite(result) else (0.0, 0.0)

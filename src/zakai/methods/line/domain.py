@@ -159,11 +159,6 @@ FAR_DISTANCES = np.array([10.0, 20.0])  # logarithms of distances at which coeff
 NOISE_GROWS = 0.1  # exponent of the noise below which it does not grow towards an end
 
 
-def lost(total: float) -> float:
-    """Return the probability that a transition of a density with the mass one lost, from the mass after it."""
-    return abs(total - 1.0)
-
-
 def ends_of_leak(prepared: Prepared, window: lw.Window, ends: Array, start: float, length: float) -> Array | None:
     """Return offsets (2,) beyond which there is no density after an interval, None where a grid loses no more than is allowed.
 

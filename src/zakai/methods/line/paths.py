@@ -43,15 +43,15 @@ class Law(NamedTuple):
 
 
 @np.errstate(all="ignore")
-def draw(prepared: Prepared, k: int, later: Array, values: Array, state: State, rng: np.random.Generator) -> tuple[Array, float]:
+def draw(prepared: Prepared, k: int, draws: Array, values: Array, state: State, rng: np.random.Generator) -> tuple[Array, float]:
     """Return draws (P, 1) of the state at the start of interval k given those at its end, and how far the law is from normal.
 
     The second is the root mean square of skewness and kurtosis, which falls with the length of the interval.
     """
     if prepared.lengths[k] == 0:
-        return later, 0.0
+        return draws, 0.0
     variable = variable_of(prepared.model)
-    z = (later if variable is None else variable.w(later))[:, 0]
+    z = (draws if variable is None else variable.w(draws))[:, 0]
     law, window, ends = _law(prepared, k, values, state)
     offsets = z - window.origin
     offsets = window.centre + wrap(offsets - window.centre) if window.closed else np.clip(offsets, *ends)

@@ -55,6 +55,11 @@ class State(NamedTuple):
     error: float
     log_floor: float
 
+    @classmethod
+    def of(cls, values: Array, window: lw.Window, error: float, log_floor: float) -> State:
+        """Return the state of probabilities on a grid."""
+        return cls(values, window.origin, window.centre, window.spacing, window.unit, window.closed, error, log_floor)
+
     @property
     def window(self) -> lw.Window:
         """The grid."""

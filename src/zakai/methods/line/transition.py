@@ -22,25 +22,22 @@ from zakai.methods.line.coefficients import (
     GROWTH,
     Coefficients,
     coefficients,
-    covariance_at,
     offset_of,
     on_grid_for_drift,
     potential_of,
     precision_of,
     resolved_parts,
     spectral,
+    speed_of,
     tables,
 )
-from zakai.methods.line.domain import lost
 from zakai.methods.line.modal import coarsened
-from zakai.methods.line.model import finite
 from zakai.methods.line.prepared import NOISE, Prepared, TimeInterval
 from zakai.methods.line.report import Report
 from zakai.methods.line.update import refitted
 from zakai.numerics.complex_step import Number
 from zakai.numerics.line import window as lw
 from zakai.numerics.line.averages import GAUSS_NODES, GAUSS_WEIGHTS
-from zakai.numerics.line.grid_choice import REACH
 from zakai.numerics.line.operator import FourierOperator, Generator, exponential_of
 from zakai.numerics.line.product import finer
 from zakai.numerics.line.resolution import (
@@ -55,42 +52,6 @@ from zakai.numerics.line.resolution import (
 )
 
 Array = NDArray[Any]
-
-CONTRACTED = -2.0  # f' times the length of an interval, below which other grids hold a density that becomes much sharper
-MOVING = 0.3  # ranges of a density that it moves in an interval without modes, above which grids move with it
-
-
-def travel(prepared: Prepared, values: Array, window: lw.Window, start: float, length: float) -> float:
-    """Return by how many of its ranges the drift moves a density in an interval, zero where grids do not move with it.
-
-    They do not where noise moves the state as far, or the density becomes much sharper.
-    """
-    system = prepared.system
-    if window.closed or prepared.kinked or system.kinks is not None or system.cross is not None or system.reflecting:
-        return 0.0
-    check, (carried, growth) = lw.grid_check(values, False), displaced(prepared, values, window, start, length)
-    G = covariance_at(system, window.points[[check.first, check.last]], start, prepared.theta.real)
-    noise = float(np.sqrt(np.max(G.real) * length))
-    if growth < CONTRACTED or abs(carried) < noise:
-        return 0.0
-    return abs(carried) / (window.spacing * (check.last - check.first + 1) + 2.0 * REACH * noise)
-
-
-def speed_of(prepared: Prepared, values: Array, window: lw.Window, start: float, length: float) -> float:
-    """Return the speed with which a grid follows a density in a substep: a whole number of its spacings in that time."""
-    carried, _ = displaced(prepared, values, window, start, length)
-    return window.spacing * float(np.round(carried / window.spacing)) / length
-
-
-def displaced(prepared: Prepared, values: Array, window: lw.Window, start: float, length: float) -> tuple[float, float]:
-    """Return about how far the drift carries the mean of a density, by its linearisation there, and f' times the length."""
-    mean, variance = lw.moments(values, window)
-    x = window.origin + float(mean.real) + float(np.sqrt(variance.real)) * np.array([0.0, -0.1, 0.1])
-    here, below, above = finite(prepared.system.drift(x[:, None], start, prepared.theta.real)[:, 0]).tolist()
-    growth = length * (above - below) / (x[2] - x[1])
-    result = length * here * (np.expm1(min(growth, 3.0)) / growth if abs(growth) > 1e-8 else 1.0)
-    return (float(result), float(growth)) if np.isfinite(result) else (0.0, 0.0)
-
 
 PARTS = (1, 4, 16)  # of a substep with six nodes each, where the grid moves
 SMOOTHED = 100.0  # decay of the shortest wave of a large grid, as a logarithm, after which a coarser grid serves
@@ -336,7 +297,10 @@ def by_decomposition(prepared: Prepared, values: Array, window: lw.Window, lengt
     known, begin = lw.grid_check(values, window.closed, negligible).aliasing, window
     while window.size <= lw.LARGEST:
         result = by_modes(prepared, values, window, length)
-        if result is None or not lost(float(np.sum(result[0].real))) < LOST_MASS:
+        if result is None:
+            return None
+        missing = abs(float(np.sum(result[0].real)) - 1.0)
+        if not missing < LOST_MASS:
             return None
         check = lw.grid_check(result[0], window.closed, negligible)
         if check.unresolved(negligible, rough):
@@ -344,7 +308,6 @@ def by_decomposition(prepared: Prepared, values: Array, window: lw.Window, lengt
         bound = edge_bound(check.aliasing)
         left, right = check.left > bound, check.right > bound
         if not (left or right):
-            missing = lost(float(np.sum(result[0].real)))
             if missing > TRANSITION_SHARE * prepared.tolerance:
                 return None
             report.time += missing
@@ -386,92 +349,116 @@ def _by_substeps(
     moving: bool,
 ) -> tuple[Prediction, float]:
     """Return the same, and the logarithm of a bound on the growth of small values relative to the density."""
-    system, negligible, check = prepared.system, prepared.negligible, None
-    _, start, length, inside, rates = interval
+    start, length = interval.start, interval.length
     gained: Number = 0.0
-    rough, resolved = noise_bound(prepared.tolerance), SPECTRUM_FACTOR * negligible
     report.positive = False
     bounds = [(0.0, length)]
-    if system.varying:
+    if prepared.system.varying:
         parts = resolved_parts(prepared, values, window, interval)
         bounds, report.time = parts.bounds, report.time + parts.error
-    stack = bounds[::-1]
-    substeps, transitions, speed, tails = 0, [], 0.0, 0.0
+    stack, check = bounds[::-1], None
+    substeps, transitions, tails = 0, [], 0.0
+
+    def regridded(check: lw.GridCheck, first: float) -> tuple[Array, lw.Window]:
+        """Return the density at a time of the interval on the grid for the next substep."""
+        result = refitted(prepared, values, window, check, large=substeps < FEW)
+        return on_grid_for_drift(prepared, *result, start + first, length - first)
+
     while stack:
         first, last = stack.pop()
         substeps += 1
-        large = window.size > lw.LARGEST and substeps < FEW
-        most = lw.SIZES[-1] if large else lw.LARGEST
         if not np.isfinite(values.real).all():
             return Prediction(values, window, np.float64(np.nan), check), tails
-        begin, grown = window, False
-        known = lw.grid_check(values, window.closed, negligible).aliasing
-        while True:
-            if moving:
-                speed = speed_of(prepared, values, window, start + first, last - first)
-            trial = trial_substep(prepared, values, window, Substep(start + first, last - first, inside, rates, speed))
-            report.decomposed = trial.substep is None
-            total = float(np.sum(trial.values.real))
-            missing = 0.0 if inside.any() else lost(total)
-            failed = not 1e-100 < total < 1e6 or missing > LOST_MASS
-            split = (trial.split or failed) and last - first > 1e-12 * length and substeps + len(stack) < MOST_SUBSTEPS
-            if split:
-                break
-            check = lw.grid_check(trial.values, window.closed, negligible)
-            coarse = check.unresolved(negligible, rough)
-            coarse = coarse and (not prepared.weak or known <= resolved)  # a finer grid has no more of the spectrum of a kink
-            bound = edge_bound(check.aliasing)
-            left, right = check.left > bound, check.right > bound
-            if not (left or right or coarse):
-                break
-            new = window
-            smooth = lw.grid_check(values, window.closed, negligible).aliasing < 0.1 * rough
-            if check.aliasing > GROSS and smooth:
-                new = window  # what such an attempt shows of the edges is not the density
-            elif left or right:
-                new, grown = lw.enlarged(new, left, right), True
-            if coarse and window.size < most and not (check.aliasing > GROSS and smooth):
-                new = lw.refined(new) if grown else finer(values, window, check)
-            if new.size <= most and new != window and not window.size == new.size == lw.SIZES[-1]:
-                values = lw.resampled(values, window, new)
-                window = new
-                continue
-            # The grid is as large as it may be: take a shorter substep, unless that does not help.
-            helps = smooth and check.aliasing > rough and (not check.rough or check.aliasing > GROSS)
-            split = (left or right or helps) and last - first > 1e-12 * length
-            split = split and substeps + len(stack) < MOST_SUBSTEPS
-            break
-        if split:
+        most = lw.SIZES[-1] if window.size > lw.LARGEST and substeps < FEW else lw.LARGEST
+        divisible = last - first > 1e-12 * length and substeps + len(stack) < MOST_SUBSTEPS
+        part = interval.part(first, last)
+        fitted = _on_fitting_grid(prepared, values, window, part, moving, most, divisible)
+        trial, values, window, check = fitted.trial, fitted.values, fitted.window, fitted.check
+        report.decomposed = trial.substep is None
+        if fitted.split:
             if trial.split and trial.error > 0:
                 stack += parts_of_split(prepared, first, last, trial.error)[::-1]
             else:
                 middle = first + (last - first) * (0.25 if last - first > 1e-3 * length else 0.0625)
                 stack += [(middle, last), (first, middle)]
-            check = lw.grid_check(values, window.closed, negligible)
-            values, window = refitted(prepared, values, window, check, large=substeps < FEW)
-            values, window = on_grid_for_drift(prepared, values, window, start + first, length - first)
+            check = lw.grid_check(values, window.closed, prepared.negligible)
+            values, window = regridded(check, first)
             continue
         assert check is not None
         if prepared.smoothing and stack:  # what a kink leaves everywhere
             check = check._replace(aliasing=0.0, left=0.0, right=0.0)
         report.density(check)
-        if window != begin:  # noise that the new grid has brought, which the transition smooths before it is seen
-            brought = lw.grid_check(values, window.closed, negligible).aliasing
-            report.aliasing = max(report.aliasing, brought - known)
-        report.time += trial.error + missing
-        begin, after = window, lw.translated(window, speed * (last - first))
+        report.aliasing = max(report.aliasing, fitted.brought)
+        report.time += trial.error + fitted.missing
+        after = window if trial.substep is None else lw.translated(window, trial.substep.speed * part.length)
         before, values = values, np.where(trial.values.real > 0, trial.values, 0.0)
         mass = np.sum(values)
-        transitions.append(RecordedTransition(before, begin, last - first, np.log(mass), after, trial.substep, trial.offset))
+        transitions.append(RecordedTransition(before, window, part.length, np.log(mass), after, trial.substep, trial.offset))
         tails = max(tails + trial.lift - float(np.log(mass.real)), 0.0)
         values, window = values / mass, after
         gained = gained + np.log(mass) + trial.offset
         if stack:
-            values, window = refitted(prepared, values, window, check, large=substeps < FEW)
-            values, window = on_grid_for_drift(prepared, values, window, start + last, length - last)
+            values, window = regridded(check, last)
     if substeps >= MOST_SUBSTEPS:
         report.time = np.inf
     return Prediction(values, window, gained, check, tuple(transitions)), tails
+
+
+class _Fitted(NamedTuple):
+    """A substep on a grid that holds it, and the density before on this grid; whether it is to be `split` instead.
+
+    `check` is that of the density after, `missing` the mass that was lost, and `brought` the spectrum at the highest frequencies
+    that the grid has brought, which the transition smooths before it is seen.
+    """
+
+    trial: Trial
+    values: Array
+    window: lw.Window
+    check: lw.GridCheck | None
+    split: bool
+    missing: float = 0.0
+    brought: float = 0.0
+
+
+def _on_fitting_grid(
+    prepared: Prepared, values: Array, window: lw.Window, part: TimeInterval, moving: bool, most: int, divisible: bool
+) -> _Fitted:
+    """Return a substep on grids of at most so many points; where none serves it is to be split, if it is `divisible`."""
+    negligible, rough, check = prepared.negligible, noise_bound(prepared.tolerance), None
+    known, begin, grown = lw.grid_check(values, window.closed, negligible).aliasing, window, False
+    while True:
+        speed = speed_of(prepared, values, window, part.start, part.length) if moving else 0.0
+        trial = trial_substep(prepared, values, window, Substep(part.start, part.length, part.inside, part.rates, speed))
+        total = float(np.sum(trial.values.real))
+        missing = 0.0 if part.inside.any() else abs(total - 1.0)
+        failed = not 1e-100 < total < 1e6 or missing > LOST_MASS
+        if (trial.split or failed) and divisible:
+            return _Fitted(trial, values, window, check, True)
+        check = lw.grid_check(trial.values, window.closed, negligible)
+        coarse = check.unresolved(negligible, rough)
+        # A finer grid has no more of the spectrum of a kink.
+        coarse = coarse and (not prepared.weak or known <= SPECTRUM_FACTOR * negligible)
+        bound = edge_bound(check.aliasing)
+        left, right = check.left > bound, check.right > bound
+        if not (left or right or coarse):
+            break
+        own = lw.grid_check(values, window.closed, negligible).aliasing
+        smooth, new = own < 0.1 * rough, window
+        if not (check.aliasing > GROSS and smooth):  # what such an attempt shows of the edges is not the density
+            if left or right:
+                new, grown = lw.enlarged(new, left, right), True
+            if coarse and window.size < most:
+                new = lw.refined(new) if grown else finer(values, window, check)
+        if new.size <= most and new != window and not window.size == new.size == lw.SIZES[-1]:
+            values, window = lw.resampled(values, window, new), new
+            continue
+        # The grid is as large as it may be: take a shorter substep, unless that does not help.
+        helps = smooth and check.aliasing > rough and (not check.rough or check.aliasing > GROSS)
+        if (left or right or helps) and divisible:
+            return _Fitted(trial, values, window, check, True)
+        break
+    brought = 0.0 if window == begin else lw.grid_check(values, window.closed, negligible).aliasing - known
+    return _Fitted(trial, values, window, check, False, missing, brought)
 
 
 def _normalised(

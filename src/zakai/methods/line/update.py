@@ -76,7 +76,7 @@ def refitted(
         prepared: what is known without data.
         values: probabilities (N,).
         window: their grid.
-        look: figures of the density by its spectrum.
+        check: figures of the density by its spectrum.
         generous: a grid of up to so many points is kept though fewer would do.
         large: whether it may have more points than a matrix of the operator.
     """
@@ -118,10 +118,14 @@ def outside_tables(prepared: Prepared, values: Array, window: lw.Points, t: floa
 def state_moments(
     prepared: Prepared, values: Array, window: lw.Window, mean: Number, variance: Number
 ) -> tuple[Number, Number]:
-    """Return the mean and variance of the state from those of the variable of the grid, relative to its origin."""
+    """Return the mean and variance of the state from those of the variable of the grid, relative to its origin.
+
+    The mean of an angle is in (-pi, pi].
+    """
     variable = variable_of(prepared.model)
     if variable is None:
-        return window.origin + mean, variance
+        mean = window.origin + mean
+        return mean - (2 * np.pi * np.ceil((mean.real - np.pi) / (2 * np.pi)) if window.closed else 0.0), variance
     offsets = variable.offset(window.points)
     mean = np.dot(offsets, values)
     apart = offsets - mean
@@ -288,11 +292,6 @@ def averaged(evaluate: Callable[[Array], Array], window: Window) -> Array:
     return np.asarray(values / np.sum(values))
 
 
-def state_of(values: Array, window: lw.Window, error: float, log_floor: float) -> State:
-    """Return the state of probabilities on a grid."""
-    return State(values, window.origin, window.centre, window.spacing, window.unit, window.closed, error, log_floor)
-
-
 def init(prepared: Prepared, prior: Prior) -> State:
     """Return the prior on a grid that fits it."""
     model, closed, variable = prepared.model, bool(prepared.model.periodic), variable_of(prepared.model)
@@ -355,4 +354,4 @@ def init(prepared: Prepared, prior: Prior) -> State:
         window = new
     if log_density is None and not closed and check.aliasing > UNRESOLVED:
         values = averaged(evaluate, window)
-    return state_of(values, window, max(0.0, check.aliasing - 1e-12), -700.0)
+    return State.of(values, window, max(0.0, check.aliasing - 1e-12), -700.0)

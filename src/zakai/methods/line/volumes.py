@@ -333,9 +333,9 @@ class BackwardExpectation(NamedTuple):
     error: float
 
     def at(self, offsets: Array) -> Array:
-        """Return the values at offsets from the origin (J,)."""
+        """Return the values at offsets from the origin (J,), beyond the outermost middles those there."""
         size = self.cells.size
-        index = self.cells.place(np.clip(offsets, *self.cells.faces[[0, -1]]))
+        index = self.cells.place(np.clip(offsets, *self.cells.offsets[[0, -1]]))
         return local_polynomial(self.values, lw.Window(0.0, size // 2 + 0.5, 1.0, size, False, 1.0), index)
 
 
@@ -350,7 +350,7 @@ def pulled_back(
 
     Args:
         prepared: the system.
-        log_worth: the logarithm of the function at offsets (J,).
+        log_values: the logarithm of the function at offsets (J,).
         density: the density before the interval, as a function of offsets (J,).
         plan: the plan of the cells, None where there is none.
         interval: the interval.

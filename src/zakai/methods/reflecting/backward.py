@@ -62,13 +62,13 @@ SUBSTEPS = 4  # of a part in which the coefficients are polynomials of time
 
 @np.errstate(all="ignore")
 def draw(
-    prepared: Prepared, k: int, later: Array, observed: np.ndarray, state: State, rng: np.random.Generator
+    prepared: Prepared, k: int, draws: Array, observed: np.ndarray, state: State, rng: np.random.Generator
 ) -> tuple[Array, float]:
     """Return draws (P, 1) of the state at the start of interval k given those at its end, and zero: their law is exact."""
     start, length = float(prepared.schedule.starts[k]), float(prepared.lengths[k])
     if length == 0:
-        return later, 0.0
-    z, uniform = later[:, 0], rng.uniform(size=len(later))
+        return draws, 0.0
+    z, uniform = draws[:, 0], rng.uniform(size=len(draws))
     element, middle, theta = state.element, start + 0.5 * length, prepared.theta.real
     x = element.points
     drift = prepared.system.drift(x[:, None], middle, theta)[:, 0]
@@ -139,7 +139,7 @@ def _window(prepared: Prepared, lower: float, upper: float) -> lw.Window:
     return points_of(lw.Window(origin, 0.0, spacing, 0, False, spacing), lower - origin, upper - origin, spacing)
 
 
-def message(prepared: Prepared, state: State) -> Message:
+def last_message(prepared: Prepared, state: State) -> Message:
     """Return the message one at the last time."""
     window = _window(prepared, float(state.lower), float(state.upper))
     return Message.of(np.zeros(window.size), window, window.spacing, 0.0)
@@ -153,62 +153,62 @@ class _Product(NamedTuple):
     log_mass: float
 
 
-def _product(prepared: Prepared, state: State, later: Message) -> _Product:
+def _product(prepared: Prepared, state: State, message: Message) -> _Product:
     element, values = state.element, np.asarray(state.values).real
     floor = SURE * (NOISE + element.unresolved(values)) * np.max(values / element.weights)
 
     def logs(x: Array) -> Array:
         density = element.at(values, x)
-        return np.where(density > floor, logarithm(density), -np.inf) + later.at(x - later.origin)
+        return np.where(density > floor, logarithm(density), -np.inf) + message.at(x - message.origin)
 
     lower, upper = placed(logs, element.lower, element.upper, domain_of(prepared))
     lower, upper = max(lower, element.lower), min(upper, element.upper)
     top = float(np.max(logs(np.linspace(lower, upper, 4 * element.size))))
-    allowed = negligible_of(prepared, float(state.error) + later.error)
+    allowed = negligible_of(prepared, float(state.error) + message.error)
     new, result = sampled(prepared, lambda x: np.exp(logs(x) - top), lower, upper, allowed)
     total = float(np.sum(result))
     return _Product(result / total, new, float(np.log(total)) + top)
 
 
 @np.errstate(all="ignore")
-def smoothed(prepared: Prepared, state: State, later: Message) -> tuple[Message, Info]:
+def smoothed(prepared: Prepared, state: State, message: Message) -> tuple[Message, Info]:
     """Return the message, normalised and without what is negligible in its product with the state, and the product's report."""
-    values, element, log_mass = _product(prepared, state, later)
+    values, element, log_mass = _product(prepared, state, message)
     mean, variance = moments(values, element)
     health = {
-        "error_estimate": float(state.error) + later.error,
-        "tolerance_ratio": (later.error + 2.0 * element.unresolved(values)) / accuracy(prepared),
+        "error_estimate": float(state.error) + message.error,
+        "tolerance_ratio": (message.error + 2.0 * element.unresolved(values)) / accuracy(prepared),
         "edge_mass": max(reached(values, element, domain_of(prepared))),
         "negative_mass": float(-np.minimum(values, 0.0).sum()),
         "aliasing": element.unresolved(values),
         "std_in_spacings": float(np.sqrt(max(variance.real, 0.0))) / element.spacing,
     }
     density = values / element.weights
-    first, last = element.points[list(support(density, negligible(prepared)))] - later.origin
-    retained = later._replace(logs=later.logs - log_mass).between(float(first), float(last))
+    first, last = element.points[list(support(density, negligible(prepared)))] - message.origin
+    retained = message._replace(logs=message.logs - log_mass).between(float(first), float(last))
     return retained, Info(log_mass, np.array([mean]), np.array([[variance]]), health)
 
 
 @np.errstate(all="ignore")
-def step(prepared: Prepared, k: int, later: Message, observed: np.ndarray, state: State) -> Message:
+def step(prepared: Prepared, k: int, message: Message, observed: np.ndarray, state: State) -> Message:
     """Return the message at the start of interval k from that at its end; `state` is the filter's at the start."""
     inside = prepared.inside[k]
-    later, before = later.on(_window(prepared, *(later.origin + end for end in later.ends))), later.variance
+    message, before = message.on(_window(prepared, *(message.origin + end for end in message.ends))), message.variance
     at_end = prepared.schedule.seen[k] & ~inside
     if at_end.any():
         likelihood = factor_at_end(prepared, k, at_end, observed, None)
-        later = later._replace(logs=later.logs + likelihood.logs(later.window.points).real)
+        message = message._replace(logs=message.logs + likelihood.logs(message.window.points).real)
     if prepared.lengths[k] == 0:
-        return later
+        return message
     interval = prepared.interval(k, inside, observed)
-    result = None if prepared.system.varying else _by_modes(prepared, later, interval, state)
-    result = _by_volumes(prepared, later, interval, state) if result is None else result
-    retained = float(np.clip(later.variance / np.sqrt(max(before * result.variance, 1e-300)), 0.3, 1.0))
-    return result._replace(error=result.error + retained * later.error)
+    result = None if prepared.system.varying else _by_modes(prepared, message, interval, state)
+    result = _by_volumes(prepared, message, interval, state) if result is None else result
+    retained = float(np.clip(message.variance / np.sqrt(max(before * result.variance, 1e-300)), 0.3, 1.0))
+    return result._replace(error=result.error + retained * message.error)
 
 
 def _by_modes(
-    prepared: Prepared, later: Message, interval: TimeInterval, state: State
+    prepared: Prepared, message: Message, interval: TimeInterval, state: State
 ) -> Message | None:
     """Return the message at the start of an interval by the modes of the operator, None where they do not serve.
 
@@ -222,10 +222,10 @@ def _by_modes(
     G = covariance_at(prepared.system, own.points, start, prepared.theta.real)
     reach = MODES_REACH * float(np.sqrt(np.max(G) * length))
     domain = domain_of(prepared)
-    low, high = np.clip([later.origin + end for end in later.ends], domain.lower, domain.upper).tolist()
+    low, high = np.clip([message.origin + end for end in message.ends], domain.lower, domain.upper).tolist()
     lower, upper = apart(min(own.lower, low) - reach, max(own.upper, high) + reach, domain)
     after = element_of(prepared, low, high, QUADRATURE)
-    logs = later.at(after.points - later.origin)
+    logs = message.at(after.points - message.origin)
     top = float(np.max(logs))
     constant: Number = 0.0
     weights = after.weights * np.exp(logs - top)
@@ -258,19 +258,19 @@ def _by_modes(
 
 
 def _by_volumes(
-    prepared: Prepared, later: Message, interval: TimeInterval, state: State
+    prepared: Prepared, message: Message, interval: TimeInterval, state: State
 ) -> Message:
     """Return the message at the start of an interval by finite volumes."""
     element, values = state.element, np.asarray(state.values).real
-    ends, (mean, variance) = np.array([0.0, element.upper - element.lower]), later.moments
-    shift = element.lower - later.origin
+    ends, (mean, variance) = np.array([0.0, element.upper - element.lower]), message.moments
+    shift = element.lower - message.origin
     aim = mean - shift, variance**0.5
     plan = cell_plan_of(prepared, values, element, ends, interval, aim)
     result = pulled_back(
-        prepared, lambda x: later.at(x + shift), lambda x: element.at(values, element.lower + x), plan, interval
+        prepared, lambda x: message.at(x + shift), lambda x: element.at(values, element.lower + x), plan, interval
     )
     if result is None:
-        return message(prepared, state)._replace(error=np.inf)
+        return last_message(prepared, state)._replace(error=np.inf)
     expectation = result
     return _on(prepared, state, lambda x: expectation.at(x - element.lower), expectation.log_scale, expectation.error)
 
@@ -284,10 +284,10 @@ def _on(prepared: Prepared, state: State, expectation: Callable[[Array], Array],
 
 
 @np.errstate(all="ignore")
-def density(prepared: Prepared, state: State, later: Message) -> IntervalDensity:
+def density(prepared: Prepared, state: State, message: Message) -> IntervalDensity:
     """Return the smoothed density."""
-    values, element, _ = _product(prepared, state, later)
+    values, element, _ = _product(prepared, state, message)
     return reflecting_filter.density(prepared, State.of(values, element, float(state.error)))
 
 
-BACKWARD: Backward[Prepared, State, Message] = Backward(message, step, smoothed, density, None, draw, accuracy)
+BACKWARD: Backward[Prepared, State, Message] = Backward(last_message, step, smoothed, density, None, draw, accuracy)
