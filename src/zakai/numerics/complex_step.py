@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 
 STEP = 1e-150
 Array = NDArray[Any]
-Number = float | complex  # with an imaginary part where a derivative is carried
 
 
 def is_complex(*arrays: Any) -> bool:

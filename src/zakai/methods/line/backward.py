@@ -10,10 +10,9 @@ Only the product of b with the filter's density matters: a message is kept where
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from zakai.densities import Density
 from zakai.methods._protocol import Backward, Info, Infos, joined, stacked
@@ -26,10 +25,9 @@ from zakai.methods.line.parts import cut
 from zakai.methods.line.paths import draw
 from zakai.methods.line.prepared import Parts, Prepared, State
 from zakai.methods.line.update import acting_inside, factor_of, state_moments
+from zakai.numerics.arrays import Array
 from zakai.numerics.line import window as lw
 from zakai.numerics.line.density import support
-
-Array = NDArray[Any]
 
 KINKED = 16.0  # points of a likelihood with kinks in the spacing that a message needs
 

@@ -8,10 +8,7 @@ between them; psi is moved by its decomposition.  Other intervals are for finite
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
-from numpy.typing import NDArray
 
 from zakai.methods.line.coefficients import covariance_at, resolved_parts, travel
 from zakai.methods.line.domain import ends_of_leak
@@ -22,27 +19,18 @@ from zakai.methods.line.prepared import Prepared, State, TimeInterval
 from zakai.methods.line.report import Report
 from zakai.methods.line.transition import MOST_SUBSTEPS, Substep, parts_of_split, trial_substep
 from zakai.methods.line.volumes import WIDENINGS, cell_plan_of, ends_of, pulled_back
+from zakai.numerics.arrays import Array
 from zakai.numerics.line import window as lw
-from zakai.numerics.line.backward import EXCURSION, FEWEST, ROUNDING
+from zakai.numerics.line.backward import EXCURSION, FEWEST, SMALLEST
 from zakai.numerics.line.density import support
-from zakai.numerics.line.resolution import ROUNDING as PRECISION
-from zakai.numerics.line.resolution import SMOOTHER_SHARE, SPECTRUM_FACTOR, TRIALS
+from zakai.numerics.line.resolution import ROUNDING, SMOOTHER_SHARE, SPECTRUM_FACTOR, TRIALS
 from zakai.numerics.line.window import local_polynomial
 
-Array = NDArray[Any]
 
 def by_exponentials(
     prepared: Prepared, interval: TimeInterval, state: State, message: Message, accepted: float
 ) -> tuple[Message, float] | None:
-    """Return the message at the start of an interval, and the error that the interval adds; None where this does not serve.
-
-    Args:
-        prepared: the system.
-        interval: the interval.
-        state: the filter's state at its start.
-        message: the message at its end.
-        accepted: the values relative to the maximum that do not count.
-    """
+    """Return what `pulled` returns, by transposed exponentials; None where they do not serve.  Less than `accepted` is none."""
     spacing = message.needed
     for _ in range(TRIALS):
         window = covering(message.window, 0.0, 0.0, min(spacing, state.spacing))
@@ -54,16 +42,14 @@ def by_exponentials(
         spacing = window.spacing / 1.5
     else:
         return None
-    density, least = reliable(state, window), ROUNDING * float(np.max(values))
+    density, least = reliable(state, window), SMALLEST * float(np.max(values))
     error += 2.0 * check.aliasing + least * float(np.sum(density) / (density @ values))
     needed = window.spacing * float(np.clip(check.resolving, 1.0, 2.0))
     logs = np.log(np.maximum(values, least)) + top + float(np.max(message.logs))
     return Message.of(logs, window, needed, message.error), error
 
 
-def _transposed(
-    prepared: Prepared, values: Array, window: lw.Window, interval: TimeInterval
-) -> tuple[Array, float, float]:
+def _transposed(prepared: Prepared, values: Array, window: lw.Window, interval: TimeInterval) -> tuple[Array, float, float]:
     """Return a message at the start of an interval, of the sum one, the logarithm of the sum before, and the error."""
     _, start, length, inside, rates = interval
     total = float(np.sum(values))
@@ -85,7 +71,7 @@ def _transposed(
     return values, top, error
 
 
-RESOLVED = 0.25  # spacing in standard deviations of the noise
+SPACING_OF_NOISE = 0.25  # spacing in standard deviations of the noise
 WIDTH = 0.8  # spacing in standard deviations of a Gaussian kernel at which sums are integrals
 MOST_POINTS = 4000  # of such sums
 
@@ -104,8 +90,6 @@ def pulled(prepared: Prepared, interval: TimeInterval, state: State, message: Me
     """Return the message at the start of an interval, and the error that the interval adds.
 
     Args:
-        prepared: the system.
-        interval: the interval.
         state: the filter's state at its start.
         message: the message at its end.
     """
@@ -149,7 +133,7 @@ def _by_kernel(
     deviation, (low, high) = float(np.sqrt(kernel.variance)), message.ends
     if (high - low) > MOST_POINTS * WIDTH * deviation:
         return None
-    spacing = min(max(message.needed, RESOLVED * deviation) / max(abs(kernel.scale), 1e-3), (ends[1] - ends[0]) / FEWEST)
+    spacing = min(max(message.needed, SPACING_OF_NOISE * deviation) / max(abs(kernel.scale), 1e-3), (ends[1] - ends[0]) / FEWEST)
     fine = points_of(message.window, low, high, min(message.spacing, WIDTH * deviation))
     new = points_of(message.window, *ends, spacing)
     x, y, theta = fine.offsets, new.offsets, prepared.theta.real
@@ -172,7 +156,7 @@ def _by_modes(
     low, high = min(message.ends[0], ends[0]), max(message.ends[1], ends[1])
     least, most = _noise(prepared, interval.k, state.origin + low, state.origin + high)
     low, high = low - EXCURSION * most, high + EXCURSION * most  # paths from one support to the other leave both
-    spacing = max(message.needed, RESOLVED * least)
+    spacing = max(message.needed, SPACING_OF_NOISE * least)
     for trial in range(TRIALS):
         window = covering(message.window, low, high, spacing)
         if window.size > lw.LARGE:
@@ -185,7 +169,7 @@ def _by_modes(
         highest = float(np.max(propagated))
         if not 0.0 < highest < np.inf:
             return None
-        error = PRECISION * float(np.sqrt(np.sum(psi * psi))) * growth / highest
+        error = ROUNDING * float(np.sqrt(np.sum(psi * psi))) * growth / highest
         if not _exact(prepared, state, propagated, operator.logs, window, error):
             return None
         check = lw.grid_check(propagated, False, accepted)
@@ -197,7 +181,7 @@ def _by_modes(
     if made > smoothing_tolerance(prepared):
         return None
     assert operator is not None
-    logs = np.log(np.maximum(propagated, ROUNDING * highest) / window.spacing) - operator.logs + top
+    logs = np.log(np.maximum(propagated, SMALLEST * highest) / window.spacing) - operator.logs + top
     needed = window.spacing * float(np.clip(check.resolving, 1.0, 2.0))
     return Message.of(logs, window, needed, message.error).between(*ends), made
 
@@ -220,7 +204,7 @@ def _exact(prepared: Prepared, state: State, psi: Array, gauge: Array, window: l
         density = reliable(state, own)
         density, offsets = density[density > 0.0], own.offsets[density > 0.0]
         log_gauge = local_polynomial(gauge, window, offsets)
-        log_psi = local_polynomial(np.log(np.maximum(psi, ROUNDING * top) / top), window, offsets)
+        log_psi = local_polynomial(np.log(np.maximum(psi, SMALLEST * top) / top), window, offsets)
     else:
         density = reliable(state, window)
         inside = density > 0.0
@@ -228,7 +212,7 @@ def _exact(prepared: Prepared, state: State, psi: Array, gauge: Array, window: l
     logs, product = np.log(density) - log_gauge, np.log(density) - log_gauge + log_psi
     shift = np.max(product)
     allowed = SMOOTHER_SHARE * smoothing_tolerance(prepared)
-    return bool(max(error, ROUNDING) * np.sum(np.exp(logs - shift)) < allowed * np.sum(np.exp(product - shift)))
+    return bool(max(error, SMALLEST) * np.sum(np.exp(logs - shift)) < allowed * np.sum(np.exp(product - shift)))
 
 
 def _by_volumes(
@@ -250,10 +234,10 @@ def _by_volumes(
     if result is None:
         return message._replace(logs=np.full(len(message.logs), np.nan)), np.inf
     least, _ = _noise(prepared, interval.k, *(state.origin + np.array(message.ends)))
-    needed = min(max(message.needed, 0.5 * RESOLVED * least), window.spacing)
+    needed = min(max(message.needed, 0.5 * SPACING_OF_NOISE * least), window.spacing)
     new = points_of(window, *ends, needed)
     values = result.at(new.offsets)
-    logs = np.log(np.maximum(values, ROUNDING * np.max(values))) + result.log_scale
+    logs = np.log(np.maximum(values, SMALLEST * np.max(values))) + result.log_scale
     return Message.of(logs, new, needed, message.error), result.error
 
 

@@ -6,30 +6,27 @@ The message is moved on the grids of the filter.  An interval that the loop refu
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from zakai.methods._protocol import Infos
 from zakai.methods.line.backward_interval import negligible, smoothing_tolerance
 from zakai.methods.line.coefficients import covariance_at, displaced
-from zakai.methods.line.loop import TOGETHER, grid_of
-from zakai.methods.line.message import LOWEST, PAD, SURE, Message, gauged, taper
+from zakai.methods.line.loop import INTERVALS_TOGETHER, grid_of
+from zakai.methods.line.message import LOWEST, PAD, SURE_OF_DENSITY, Message, gauged, taper
 from zakai.methods.line.prepared import SHARE, Prepared, State
 from zakai.methods.line.update import factor_at_end, state_moments
+from zakai.numerics.arrays import Array
 from zakai.numerics.line import backward as lb
 from zakai.numerics.line import window as lw
 from zakai.numerics.line.backward import EXCURSION, by_adjoints
 from zakai.numerics.line.density import support
-from zakai.numerics.line.resolution import ROUNDING as PRECISION
-from zakai.numerics.line.resolution import SMOOTHER_SHARE
+from zakai.numerics.line.resolution import ROUNDING, SMOOTHER_SHARE
 from zakai.numerics.line.steps import SPLIT, SPLIT_FACTOR
 
-Array = NDArray[Any]
-
 STRIDES = (1, 2, 4)  # points of psi in a spacing of the filter's grid
-APART = 32  # the ends of a grid for a decomposition are multiples of so many spacings
+SPACINGS_APART = 32  # the ends of a grid for a decomposition are multiples of so many spacings
 
 
 class BackwardSegment(NamedTuple):
@@ -46,8 +43,6 @@ def back(
     """Take a message back over the last of some intervals, None where the loop takes none of them.
 
     Args:
-        prepared: the system.
-        rows: the intervals.
         states: those of the filter before and after them.
         message: the message after the last interval.
         product, grid: the smoothed density at the same time, and its grid.
@@ -61,7 +56,7 @@ def back(
     if split and shared and not shared[-1].closed:
         shared.append(lw.refined(shared[-1], 2.0))  # for a kernel that is narrow in spacings
     for window in shared:
-        begin, most = k, TOGETHER
+        begin, most = k, INTERVALS_TOGETHER
         own = states[k - first].window
         if not _holds(window, *own.offsets[[0, -1]]) or (split and window.spacing < own.spacing):
             most = 1
@@ -101,7 +96,7 @@ def _exact(prepared: Prepared, k: int, state: State) -> bool:
     displacement, _ = displaced(prepared, values, state.window, start, length)
     noise = length * covariance_at(prepared.system, np.array([state.origin + mean]), start, prepared.theta.real)
     lost = displacement**2 / noise * (1.0 + variance / noise)
-    return bool(np.all(lost < np.log(SMOOTHER_SHARE * smoothing_tolerance(prepared) / PRECISION)))
+    return bool(np.all(lost < np.log(SMOOTHER_SHARE * smoothing_tolerance(prepared) / ROUNDING)))
 
 
 def _on_one_grid(
@@ -148,7 +143,7 @@ def _on_one_grid(
 def _before(states: Sequence[State], window: lw.Window) -> tuple[lb.Filtered, Array]:
     """Return the filter's densities on grids of one spacing and size, and the centres of these."""
     own, values = states[0].window, np.array([state.values for state in states])
-    floors = SURE * np.exp(np.minimum([float(state.log_floor) for state in states], LOWEST))
+    floors = SURE_OF_DENSITY * np.exp(np.minimum([float(state.log_floor) for state in states], LOWEST))
     centres = np.array([state.centre for state in states])
     if (own.spacing, own.size) != (window.spacing, window.size) or (len(states) == 1 and own != window):
         values, centres = np.array([lw.resampled(one, own, window) for one in values]), np.full(len(states), window.centre)
@@ -222,8 +217,8 @@ def _longer(prepared: Prepared, window: lw.Window, stride: int, length: float) -
     reach = EXCURSION * float(np.sqrt(np.max(covariance) * length)) / spacing
     reach = PAD + 2.0 ** (1.0 + 2.0 * np.ceil(0.5 * np.log2(np.clip(reach, 8.0, lw.LARGE) / 2.0)))
     begin = stride * _first(window)
-    low = int(APART * np.floor((begin - reach) / APART))
-    size = int(APART * np.ceil((begin + stride * window.size + reach) / APART)) - low
+    low = int(SPACINGS_APART * np.floor((begin - reach) / SPACINGS_APART))
+    size = int(SPACINGS_APART * np.ceil((begin + stride * window.size + reach) / SPACINGS_APART)) - low
     return window._replace(centre=spacing * (low + size // 2), size=size, spacing=spacing)
 
 

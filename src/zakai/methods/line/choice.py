@@ -9,10 +9,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from zakai.methods.line.coefficients import on_grid_for_drift, travel
 from zakai.methods.line.kernel import by_kernel, kernel_of
@@ -21,12 +20,10 @@ from zakai.methods.line.report import Report
 from zakai.methods.line.transition import Prediction, by_decomposition, by_substeps
 from zakai.methods.line.update import refitted
 from zakai.methods.line.volumes import contracted
+from zakai.numerics.arrays import Array
 from zakai.numerics.line import window as lw
 from zakai.numerics.line.gaussian_kernels import Channel
 from zakai.numerics.line.grid_choice import FAR
-
-Array = NDArray[Any]
-
 
 MOVING = 0.3  # ranges of a density that it moves in an interval without modes, above which grids move with it
 

@@ -12,22 +12,19 @@ sense of Stratonovich.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from zakai.methods.line.cache import Derived
 from zakai.methods.line.model import System, finite, within
 from zakai.methods.line.prepared import Prepared, TimeInterval
-from zakai.numerics.complex_step import Number
+from zakai.numerics.arrays import Array, Number
 from zakai.numerics.line import window as lw
 from zakai.numerics.line.averages import GAUSS_NODES, GAUSS_WEIGHTS, Panels, panels
 from zakai.numerics.line.grid_choice import PER, PROFILE, REACH
 from zakai.numerics.line.operator import Spectral, symmetric
-from zakai.numerics.line.product import PARTS, at_nodes, nodes, weak
-
-Array = NDArray[Any]
+from zakai.numerics.line.product import NODES_OF_SPACING, at_nodes, nodes, weak
 
 _MIDPOINTS = (np.arange(32) + 0.5) / 32.0 - 0.5
 
@@ -111,9 +108,7 @@ def gauge_at(prepared: Prepared, points: Array, parts: int = 1) -> Array:
     return np.append(0.0, np.cumsum(steps * (slopes.reshape(len(steps), parts, -1) @ GAUSS_WEIGHTS).sum(axis=1)))
 
 
-def decomposed(
-    prepared: Prepared, window: lw.Window, largest: int, ends: tuple[Array, Array] | None = None
-) -> Spectral | None:
+def decomposed(prepared: Prepared, window: lw.Window, largest: int, ends: tuple[Array, Array] | None = None) -> Spectral | None:
     """Return the decomposition of the operator on a grid of at most so many points, None where there is none.
 
     With `ends`, F'/F and its derivative (N,) of a function F, the drift in the symmetric operator is f + G F'/F.
@@ -125,7 +120,7 @@ def decomposed(
         return None
     if not (covariance.real > 0).all():
         return None
-    points, parts = window.points[:, None], PARTS if system.rough else 1
+    points, parts = window.points[:, None], NODES_OF_SPACING if system.rough else 1
     spread = curvature = np.zeros(1)
     scale = np.ones(1)
     gauge = gauge_at(prepared, np.append(window.points, window.points[-1] + window.spacing), parts)
@@ -235,9 +230,7 @@ def offset_of(potential: Array, values: Array) -> tuple[float, float]:
     return top, float(np.max(potential.real)) - top
 
 
-def resolved_parts(
-    prepared: Prepared, values: Array, window: lw.Points, interval: TimeInterval
-) -> Panels:
+def resolved_parts(prepared: Prepared, values: Array, window: lw.Points, interval: TimeInterval) -> Panels:
     """Return parts of the interval in each of which the coefficients are polynomials of time, nearly."""
     system, theta, (_, start, length, inside, _) = prepared.system, prepared.theta.real, interval
     check = lw.grid_check(values, window.closed)
@@ -269,18 +262,11 @@ def resolved_parts(
 
 
 def with_cross_noise(
-    prepared: Prepared,
-    points: Array,
-    times: Array,
-    rates: Array,
-    h: Array,
-    precision: Array,
-    coefficients: Coefficients,
+    prepared: Prepared, points: Array, times: Array, rates: Array, h: Array, precision: Array, coefficients: Coefficients
 ) -> Coefficients:
     """Return the coefficients of the equation with correlated noise from those with independent noise.
 
     Args:
-        prepared: the system.
         points: the points (N, 1) or (T, N, 1).
         times: (T,).
         rates: dy/dt (m,).

@@ -24,11 +24,9 @@ At the limit of Feller, kappa = 1, that is no small number for any e.  Finite vo
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 import sympy as sp
-from numpy.typing import NDArray
 
 from zakai.densities.mapped import IntervalMap
 from zakai.errors import InputError
@@ -39,10 +37,9 @@ from zakai.models.domain import Interval
 from zakai.models.kept import kept, once_for_a_model
 from zakai.models.model import Model
 from zakai.models.numeric import numpy_function
+from zakai.numerics.arrays import Array
 from zakai.numerics.line import window as lw
 from zakai.numerics.line.resolution import EDGE, SUPPORT, TRANSITION_SHARE
-
-Array = NDArray[Any]
 
 # attributes that a model computes from its formulas
 _DERIVED = ("text", "observation_law", "covariance", "features", "depends_on_time", "_kept")
@@ -103,9 +100,9 @@ def on_the_line(model: Model) -> Model:
     return other
 
 
-NEAR = 1e-9  # distance from an end other than zero, relative to it and to the length of the domain
+NEAR_END = 1e-9  # distance from an end other than zero, relative to it and to the length of the domain
 NEAR_ZERO = 1e-40  # distance from zero, near which numbers have no rounding of their own
-APART = 1e3  # ratio of the two distances that show a power
+RATIO_OF_DISTANCES = 1e3  # ratio of the two distances that show a power
 GROWS = 1.5  # ratio of values there that have no finite limit
 EXACT = 1e-5  # by which kappa may miss its limit
 
@@ -131,7 +128,7 @@ def check_ends(model: Model, theta: Array, inputs: Array | None) -> None:
         if not np.isfinite(end):
             continue
         scale = abs(end) if not interval.bounded else max(abs(end), interval.upper - interval.lower)
-        near = end + side * np.array([APART, 1.0]) * (NEAR_ZERO if end == 0 else NEAR * scale)
+        near = end + side * np.array([RATIO_OF_DISTANCES, 1.0]) * (NEAR_ZERO if end == 0 else NEAR_END * scale)
         d = np.abs(near - end)
         with np.errstate(all="ignore"):
             values = function(near[:, None], model.start, theta.real, None if u is None else u[:, None]).reshape(-1, 2, 2)
@@ -163,8 +160,6 @@ def ends_of_leak(prepared: Prepared, window: lw.Window, ends: Array, start: floa
     """Return offsets (2,) beyond which there is no density after an interval, None where a grid loses no more than is allowed.
 
     Args:
-        prepared: the system.
-        window: the grid.
         ends: the ends of the density as offsets from the origin (2,).
         start, length: the interval.
     """

@@ -14,10 +14,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from zakai.densities import Density, GridDensity, MappedDensity
 from zakai.methods._protocol import Info, Infos, joined, stacked
@@ -44,14 +43,12 @@ from zakai.methods.line.update import (
 )
 from zakai.methods.line.update import init as init
 from zakai.models.model import Model
-from zakai.numerics.complex_step import Number
+from zakai.numerics.arrays import Array, Number
 from zakai.numerics.line import window as lw
 from zakai.numerics.line.density import separated
 from zakai.numerics.line.product import General, Likelihood, Product, multiplied
 from zakai.numerics.line.resolution import noise_bound
 from zakai.records.schedule import Schedule
-
-Array = NDArray[Any]
 
 SLOW = 1e-2  # of the tolerance: the spectrum that need not be resolved where f has kinks
 SLOW_GENEROUS = 256  # points of a grid that is retained though fewer would do

@@ -12,31 +12,23 @@ is large b is not retained.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from zakai.methods.line.coefficients import Coefficients, coefficients, covariance_at, resolved_parts
-from zakai.methods.line.message import SURE, Message, reliable
+from zakai.methods.line.message import SURE_OF_DENSITY, Message, reliable
 from zakai.methods.line.model import finite
 from zakai.methods.line.prepared import Prepared, State, TimeInterval
-from zakai.methods.line.transition import (
-    MOST_SUBSTEPS,
-    Substep,
-    Trial,
-    magnus,
-    parts_of_split,
-)
+from zakai.methods.line.transition import MOST_SUBSTEPS, Substep, Trial, magnus, parts_of_split
+from zakai.numerics.arrays import Array
 from zakai.numerics.line import window as lw
-from zakai.numerics.line.backward import FEWEST, ROUNDING
+from zakai.numerics.line.backward import FEWEST, SMALLEST
 from zakai.numerics.line.density import support
 from zakai.numerics.line.resolution import SUPPORT, TRIALS
 
-Array = NDArray[Any]
-
 BULK = 1e-7  # of the maximum: there smaller values may be tails
-NEAR = 5  # points of a message that tell the curvature of its logarithm beyond an end
+POINTS_OF_CURVATURE = 5  # points of a message that tell the curvature of its logarithm beyond an end
 STEEP = 3.0  # least fall beyond the ends of a message, in deviations
 RELAXED = 4.0  # spacings that a message may need: its product with the density shows whether it does
 
@@ -62,7 +54,7 @@ class Psi(NamedTuple):
 
     def reliable(self, weights: Array | float = 1.0) -> tuple[int, int]:
         """Return the first and the last point of psi times weights that are no noise, as far outward as this falls."""
-        product = np.where(self.values.real > SURE * np.abs(self.values.imag), self.values.real, 0.0) * weights
+        product = np.where(self.values.real > SURE_OF_DENSITY * np.abs(self.values.imag), self.values.real, 0.0) * weights
         first, last = support(product, BULK)
         while first > 0 and 0.0 < product[first - 1] < product[first]:
             first -= 1
@@ -107,13 +99,13 @@ def placed(message: Message, centre: float, deviation: float, spacing: float, re
     total = float(np.sum(values))
     if not np.isfinite(total):
         return None
-    unknown = np.max(curvatures[:NEAR]) * left**2 + np.max(curvatures[-NEAR:]) * right**2
-    values = values + 1j * (values * np.minimum(unknown, 1.0) + ROUNDING)
+    unknown = np.max(curvatures[:POINTS_OF_CURVATURE]) * left**2 + np.max(curvatures[-POINTS_OF_CURVATURE:]) * right**2
+    values = values + 1j * (values * np.minimum(unknown, 1.0) + SMALLEST)
     scales = deviation ** -np.arange(3.0)[:, None]
     return Psi(values / total, window, gauges * scales, top + float(np.log(total)))
 
 
-MARGIN = 1.2  # of a wider grid
+WIDER_GRID = 1.2  # of a wider grid
 ROUGH = 1e-3  # of the tolerance that noise of psi may leave
 
 
@@ -123,8 +115,6 @@ def by_moving_grid(
     """Return the message at the start of interval k, and the error that the interval adds; None where this does not serve.
 
     Args:
-        prepared: the system.
-        interval: the interval.
         state: the filter's state at its start.
         message: the message at its end.
         accepted: the values relative to the maximum that do not count.
@@ -135,7 +125,7 @@ def by_moving_grid(
     while stack:
         first, last = stack.pop()
         if psi is None:
-            psi = placed(source, centre, deviation, spacing, SUPPORT * deviation * MARGIN ** (tried // 2))
+            psi = placed(source, centre, deviation, spacing, SUPPORT * deviation * WIDER_GRID ** (tried // 2))
             if psi is None or tried > TRIALS:
                 return None
             psi = psi._replace(scaled=scaled)

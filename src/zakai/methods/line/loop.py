@@ -10,7 +10,6 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from zakai.methods._protocol import Info, Infos, joined
 from zakai.methods._states import Joined, StackedStates
@@ -19,6 +18,7 @@ from zakai.methods.line.cache import Derived
 from zakai.methods.line.coefficients import misses_drift, on_grid_for_drift
 from zakai.methods.line.prepared import Prepared, State
 from zakai.methods.line.update import edge_of_moments, grid_check, on_fitting_grid, outside_tables, resampled, state_moments
+from zakai.numerics.arrays import Array
 from zakai.numerics.line import window as lw
 from zakai.numerics.line.averages import GAUSS_NODES, parts_needed, probed
 from zakai.numerics.line.gaussian_kernels import BAND
@@ -26,21 +26,7 @@ from zakai.numerics.line.loop import advance
 from zakai.numerics.line.modes_loop import OWN, PLACE, STAY
 from zakai.numerics.line.product import at_nodes, nodes
 from zakai.numerics.line.resolution import TRIALS
-from zakai.numerics.line.steps import (
-    CELL,
-    COLUMNS,
-    DRIFT,
-    MARGIN,
-    OBSERVED,
-    PHI,
-    SLOPE,
-    Grid,
-    Segment,
-    Start,
-    Status,
-)
-
-Array = NDArray[Any]
+from zakai.numerics.line.steps import CELL, COLUMNS, DRIFT, OBSERVED, PHI, SLOPE, TABLE_MARGIN, Grid, Segment, Start, Status
 
 BLOCK = 2048  # points by which the tables of a spacing are apart; a table has twice as many
 LOBATTO = np.array([0.0, 0.5 - 0.5 / np.sqrt(5.0), 0.5 + 0.5 / np.sqrt(5.0)])  # nodes within a spacing
@@ -53,7 +39,7 @@ def grid_of(prepared: Prepared, window: lw.Window, rows: slice) -> Grid | None:
     if window.closed:
         begin, length = 0, size
     elif prepared.mixed:
-        begin, length = index - size // 2 - MARGIN, size + 2 * MARGIN
+        begin, length = index - size // 2 - TABLE_MARGIN, size + 2 * TABLE_MARGIN
     else:
         begin, length = BLOCK * round(index / BLOCK) - BLOCK, 2 * BLOCK
     start = 0 if window.closed else index - size // 2 - begin
@@ -139,7 +125,7 @@ def _mixed(prepared: Prepared, window: lw.Window, x: np.ndarray, rows: slice) ->
 
 
 LARGER = 0.2  # margin of a new grid, relative to the range of the density
-TOGETHER = 32  # intervals whose tables of coefficients in time are computed together
+INTERVALS_TOGETHER = 32  # intervals whose tables of coefficients in time are computed together
 HEALTH = {
     "edge_mass": "edge",
     "negative_mass": "negative",
@@ -250,7 +236,7 @@ def _on_one_table(
     prepared: Prepared, rows: slice, state: State, window: lw.Window, observed: np.ndarray
 ) -> tuple[Piece | None, Status, Array]:
     """Return the first steps of `rows` by kernels or splitting, why they end, and the grid that is needed."""
-    together = 1 if prepared.cut_up else TOGETHER if prepared.mixed else len(observed)
+    together = 1 if prepared.cut_up else INTERVALS_TOGETHER if prepared.mixed else len(observed)
     here = slice(rows.start, min(rows.stop, rows.start + together))
     grid = grid_of(prepared, window, here)
     if grid is None:

@@ -7,26 +7,24 @@ towards the ends of the grid: its operator is that of a density, with the drift 
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from zakai.methods.line.cache import Derived
 from zakai.methods.line.coefficients import decomposed
 from zakai.methods.line.prepared import Prepared, State
+from zakai.numerics.arrays import Array
 from zakai.numerics.line import window as lw
 from zakai.numerics.line.backward import FEWEST
 from zakai.numerics.line.operator import Spectral
 from zakai.numerics.line.window import local_polynomial
 
-Array = NDArray[Any]
-
 FALL = 3.3  # spacings over which F falls
 HALF = 14.0  # spacings from where F is one to where it is one half
 PAD = 28  # spacings over which F falls to zero
-FEW = 16  # larger grids have a multiple of so many points: few different sizes
-SURE = 10.0  # errors of a density from which its small values count
+SIZE_STEP = 16  # larger grids have a multiple of so many points: few different sizes
+SURE_OF_DENSITY = 10.0  # errors of a density from which its small values count
 LOWEST = -30.0  # logarithm of the largest error of small values, relative to the largest value
 
 
@@ -132,14 +130,14 @@ def points_of(window: lw.Window, low: float, high: float, spacing: float) -> lw.
     spacing = lw.quantized(window, low, high, spacing).spacing
     first, last = np.floor(low / spacing + 1e-9), np.ceil(high / spacing - 1e-9)
     size = max(int(last - first) + 1, FEWEST)
-    size = size if size < 4 * FEW else FEW * -(-size // FEW)
+    size = size if size < 4 * SIZE_STEP else SIZE_STEP * -(-size // SIZE_STEP)
     return window._replace(centre=float((first + size // 2) * spacing), spacing=spacing, size=size)
 
 
 def reliable(state: State, window: lw.Window) -> Array:
     """Return the density on another grid, zero where its error is as large."""
     values = np.asarray(state.values).real
-    floor = SURE * float(np.exp(min(state.log_floor, LOWEST))) * float(np.max(values))
+    floor = SURE_OF_DENSITY * float(np.exp(min(state.log_floor, LOWEST))) * float(np.max(values))
     return lw.resampled(np.where(values > floor, values, 0.0), state.window, window)
 
 

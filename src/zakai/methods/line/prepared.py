@@ -10,10 +10,9 @@ from __future__ import annotations
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
-from typing import Any, NamedTuple, TypeVar
+from typing import NamedTuple, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from zakai.methods.line.cache import CacheKey, Derived, GridCache, grid_cache_of
 from zakai.methods.line.model import System, finite
@@ -22,6 +21,7 @@ from zakai.methods.system.notes import OMITTED
 from zakai.methods.yau.kernel import PowerSeries
 from zakai.models.model import Model
 from zakai.models.prior import GaussianPrior
+from zakai.numerics.arrays import Array
 from zakai.numerics.complex_step import log_determinant
 from zakai.numerics.line import window as lw
 from zakai.numerics.line.averages import GAUSS_NODES, parts_needed, probed
@@ -29,8 +29,6 @@ from zakai.numerics.line.gaussian_kernels import kernel_size, packed
 from zakai.numerics.line.resolution import GROSS
 from zakai.numerics.line.steps import FACTOR, KERNEL, SPLIT, SPLIT_FACTOR, Limits, Mechanisms, Steps
 from zakai.records.schedule import Schedule, lengths_of
-
-Array = NDArray[Any]
 
 T = TypeVar("T")
 

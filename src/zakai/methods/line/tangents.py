@@ -10,10 +10,8 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from sympy import sympify
 
 from zakai.methods._protocol import Infos, Tangents
@@ -25,13 +23,12 @@ from zakai.methods.line.parts import segment_of_parts
 from zakai.methods.line.prepared import Parts, Prepared, State
 from zakai.methods.line.transition import RecordedTransition, Substep, exponents_of
 from zakai.methods.line.update import factor_of
-from zakai.numerics.complex_step import STEP, Number
+from zakai.numerics.arrays import Array, Number
+from zakai.numerics.complex_step import STEP
 from zakai.numerics.line import window as lw
 from zakai.numerics.line.splitting import Interval, TangentCoefficients, through
 from zakai.numerics.line.steps import SPLIT
 from zakai.numerics.line.tangents import Varied, exponential_tangents, extended, resampled_tangents
-
-Array = NDArray[Any]
 
 IN_TIME = "drifts", "outputs", "covariances", "precisions"
 
@@ -42,10 +39,7 @@ def tangents(
     """Return what `line_filter.segment` returns, with derivatives; None where likelihoods act in the weak sense.
 
     Args:
-        prepared: what is known without data.
         shifted: the same at parameters of which the i-th has an infinitesimal imaginary part, for i < p.
-        rows: the intervals.
-        state: the state before them.
         shifted_states: the same at the p parameters.
         observed: what is observed (K, m).
     """

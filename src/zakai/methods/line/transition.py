@@ -12,10 +12,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from zakai.methods.line.cache import Derived
 from zakai.methods.line.coefficients import (
@@ -35,7 +34,7 @@ from zakai.methods.line.modal import coarsened
 from zakai.methods.line.prepared import NOISE, Prepared, TimeInterval
 from zakai.methods.line.report import Report
 from zakai.methods.line.update import refitted
-from zakai.numerics.complex_step import Number
+from zakai.numerics.arrays import Array, Number
 from zakai.numerics.line import window as lw
 from zakai.numerics.line.averages import GAUSS_NODES, GAUSS_WEIGHTS
 from zakai.numerics.line.operator import FourierOperator, Generator, exponential_of
@@ -51,9 +50,7 @@ from zakai.numerics.line.resolution import (
     spectrum_bound,
 )
 
-Array = NDArray[Any]
-
-PARTS = (1, 4, 16)  # of a substep with six nodes each, where the grid moves
+PARTS_OF_SUBSTEP = (1, 4, 16)  # of a substep with six nodes each, where the grid moves
 SMOOTHED = 100.0  # decay of the shortest wave of a large grid, as a logarithm, after which a coarser grid serves
 MAGNUS = 0.02  # of the tolerance that one substep of Magnus' series may leave
 
@@ -210,14 +207,12 @@ def magnus(
     """Advance a substep by the exponentials of `_of_magnus`, with as many nodes as they need.
 
     Args:
-        prepared: the system.
         values, window: the density and its grid.
-        substep: the substep.
         at: a function that returns f, G, V and a constant, as `coefficients`, at parts of the substep from zero to one.
         adjoint: whether a message is taken from the end to the start.
         moving: whether the grid moves.
     """
-    for parts in PARTS if moving else PARTS[:1]:
+    for parts in PARTS_OF_SUBSTEP if moving else PARTS_OF_SUBSTEP[:1]:
         substep = substep._replace(parts=parts)
         averages, error, length = _averaged(substep, at, not prepared.system.varying and not moving), 0.0, substep.length
         if moving:
@@ -257,7 +252,7 @@ def by_modes(prepared: Prepared, values: Array, window: lw.Window, length: float
 
 
 MOST_SUBSTEPS = 4000
-FEW = 24  # substeps of an interval, after which no large grid is used
+SUBSTEPS_OF_LARGE_GRID = 24  # substeps of an interval, after which no large grid is used
 
 
 class RecordedTransition(NamedTuple):
@@ -323,12 +318,7 @@ def by_decomposition(prepared: Prepared, values: Array, window: lw.Window, lengt
 
 
 def by_substeps(
-    prepared: Prepared,
-    values: Array,
-    window: lw.Window,
-    interval: TimeInterval,
-    report: Report,
-    moving: bool = False,
+    prepared: Prepared, values: Array, window: lw.Window, interval: TimeInterval, report: Report, moving: bool = False
 ) -> Prediction:
     """Return the density after an interval, by exponentials of its operator, on grids that move with it or are fixed."""
     result, tails = _by_substeps(prepared, values, window, interval, report, moving)
@@ -341,12 +331,7 @@ def by_substeps(
 
 
 def _by_substeps(
-    prepared: Prepared,
-    values: Array,
-    window: lw.Window,
-    interval: TimeInterval,
-    report: Report,
-    moving: bool,
+    prepared: Prepared, values: Array, window: lw.Window, interval: TimeInterval, report: Report, moving: bool
 ) -> tuple[Prediction, float]:
     """Return the same, and the logarithm of a bound on the growth of small values relative to the density."""
     start, length = interval.start, interval.length
@@ -361,7 +346,7 @@ def _by_substeps(
 
     def regridded(check: lw.GridCheck, first: float) -> tuple[Array, lw.Window]:
         """Return the density at a time of the interval on the grid for the next substep."""
-        result = refitted(prepared, values, window, check, large=substeps < FEW)
+        result = refitted(prepared, values, window, check, large=substeps < SUBSTEPS_OF_LARGE_GRID)
         return on_grid_for_drift(prepared, *result, start + first, length - first)
 
     while stack:
@@ -369,7 +354,7 @@ def _by_substeps(
         substeps += 1
         if not np.isfinite(values.real).all():
             return Prediction(values, window, np.float64(np.nan), check), tails
-        most = lw.SIZES[-1] if window.size > lw.LARGEST and substeps < FEW else lw.LARGEST
+        most = lw.SIZES[-1] if window.size > lw.LARGEST and substeps < SUBSTEPS_OF_LARGE_GRID else lw.LARGEST
         divisible = last - first > 1e-12 * length and substeps + len(stack) < MOST_SUBSTEPS
         part = interval.part(first, last)
         fitted = _on_fitting_grid(prepared, values, window, part, moving, most, divisible)

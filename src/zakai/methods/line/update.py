@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from zakai.errors import InputError
 from zakai.methods.line.cache import Derived
@@ -17,7 +15,8 @@ from zakai.methods.line.prepared import Prepared, State
 from zakai.methods.system.observation import log_likelihood
 from zakai.models.numeric import numpy_function
 from zakai.models.prior import DensityPrior, Prior
-from zakai.numerics.complex_step import Number, log_determinant
+from zakai.numerics.arrays import Array, Number
+from zakai.numerics.complex_step import log_determinant
 from zakai.numerics.line import window as lw
 from zakai.numerics.line.averages import GAUSS_NODES, GAUSS_WEIGHTS, panels
 from zakai.numerics.line.density import support
@@ -39,9 +38,7 @@ from zakai.numerics.line.resolution import RESOLVED, TRIALS
 from zakai.numerics.line.window import Window
 from zakai.numerics.prior_grid import mixture_log_density, prior_grid
 
-Array = NDArray[Any]
-
-UNRESOLVED = 1e-6  # spectrum at the highest frequencies from which waves hide where a density ends, and a prior is averaged
+HIDING_WAVES = 1e-6  # spectrum at the highest frequencies from which waves hide where a density ends, and a prior is averaged
 
 
 def resampled(prepared: Prepared, values: Array, window: lw.Window, new: lw.Window) -> Array:
@@ -60,7 +57,7 @@ def grid_check(prepared: Prepared, values: Array, window: lw.Window) -> lw.GridC
     kinks of likelihoods a coarser grid would fold it, and a finer one has no more of it.
     """
     check = lw.grid_check(values, window.closed, prepared.negligible, prepared.cut)
-    if prepared.kinked or check.aliasing > UNRESOLVED:
+    if prepared.kinked or check.aliasing > HIDING_WAVES:
         noise = 0.0 if prepared.weak else 1e-2 * check.aliasing  # of waves that the transition leaves everywhere
         first, last = support(np.ascontiguousarray(values.real), max(prepared.cut, noise))
         check = check._replace(first=first, last=last)
@@ -73,9 +70,7 @@ def refitted(
     """Return a density on the grid for its next substep, and this grid.
 
     Args:
-        prepared: what is known without data.
         values: probabilities (N,).
-        window: their grid.
         check: figures of the density by its spectrum.
         generous: a grid of up to so many points is kept though fewer would do.
         large: whether it may have more points than a matrix of the operator.
@@ -115,9 +110,7 @@ def outside_tables(prepared: Prepared, values: Array, window: lw.Points, t: floa
     return float(values.real @ prepared.system.outside(window.points, t, prepared.theta) / np.sum(values.real))
 
 
-def state_moments(
-    prepared: Prepared, values: Array, window: lw.Window, mean: Number, variance: Number
-) -> tuple[Number, Number]:
+def state_moments(prepared: Prepared, values: Array, window: lw.Window, mean: Number, variance: Number) -> tuple[Number, Number]:
     """Return the mean and variance of the state from those of the variable of the grid, relative to its origin.
 
     The mean of an angle is in (-pi, pi].
@@ -352,6 +345,6 @@ def init(prepared: Prepared, prior: Prior) -> State:
         if new == window or trial == TRIALS - 1:  # the values belong to this window
             break
         window = new
-    if log_density is None and not closed and check.aliasing > UNRESOLVED:
+    if log_density is None and not closed and check.aliasing > HIDING_WAVES:
         values = averaged(evaluate, window)
     return State.of(values, window, max(0.0, check.aliasing - 1e-12), -700.0)

@@ -8,10 +8,9 @@ steps are refined until the result settles.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from zakai.methods.line.coefficients import coefficients, covariance_at, resolved_parts
 from zakai.methods.line.domain import ends_of_leak
@@ -19,14 +18,12 @@ from zakai.methods.line.model import finite, within
 from zakai.methods.line.prepared import Prepared, TimeInterval
 from zakai.methods.line.report import Report
 from zakai.methods.line.transition import Prediction
-from zakai.numerics.complex_step import Number
+from zakai.numerics.arrays import Array, Number
 from zakai.numerics.line import window as lw
 from zakai.numerics.line.averages import GAUSS_NODES, Panels, interpolation
 from zakai.numerics.line.resolution import RESOLVED, ROUNDING, SUPPORT, TRANSITION_SHARE
 from zakai.numerics.line.volumes import Bands, Volumes, advanced, ends_of_steps, volumes
 from zakai.numerics.line.window import local_polynomial
-
-Array = NDArray[Any]
 
 FAST = 5.0  # ranges of a density that the drift crosses in an interval, below which it is not followed
 LEVELS = ((256, 24), (512, 34), (1024, 48), (2048, 68), (4096, 96), (8192, 136), (16384, 192))  # cells and steps
@@ -74,10 +71,8 @@ def cell_plan_of(
     """Return the plan of cells for a density between two offsets, None where the drift leads beyond all numbers.
 
     Args:
-        prepared: the system.
         values, window: the density before the interval, and its grid.
         ends: its ends as offsets from the origin.
-        interval: the interval.
         aim: the mean and the standard deviation of a function of the state at the end that is taken back to the start.
         widening: the most by which the range of the density grows on each side.
     """
@@ -212,13 +207,13 @@ def _relative(x: Array) -> Array:
     return np.where(small, 1.0, np.expm1(x) / np.where(small, 1.0, x))
 
 
-FINE = 300.0  # phase by which the drift turns the shortest wave of a large grid, above which that is not tried
-STIFF = 100.0  # the same, above which no uniform grid is tried
+TURNING_OF_LARGE_GRID = 300.0  # phase by which the drift turns the shortest wave of a large grid, above which that is not tried
+TURNING = 100.0  # the same, above which no uniform grid is tried
 MOST_TRAVEL = 20.0  # ranges of a density, as it is at the time, that it moves on uniform grids
 MOST_DEVIATIONS = 100.0  # range of a density on a uniform grid, in the smallest deviations of its parts
-EDGE = 1e-9  # density in the outermost cells, relative to the maximum, beyond which they are too few
+EDGE_OF_CELLS = 1e-9  # density in the outermost cells, relative to the maximum, beyond which they are too few
 SETTLED = 1e-2  # error above which volumes do not serve
-NARROWEST = 40.0  # range of a density in cells
+NARROWEST_IN_CELLS = 40.0  # range of a density in cells
 WIDENINGS = 0.5, 2.0  # ranges of a density by which it grows on each side, where that error is too large
 SMOOTH = 1e-7  # error of a backward interval at which more cells are not tried
 
@@ -231,12 +226,7 @@ def rough(prepared: Prepared, inside: np.ndarray) -> bool:
 
 
 def contracted(
-    prepared: Prepared,
-    values: Array,
-    window: lw.Window,
-    interval: TimeInterval,
-    report: Report,
-    moving: bool,
+    prepared: Prepared, values: Array, window: lw.Window, interval: TimeInterval, report: Report, moving: bool
 ) -> Prediction | None:
     """Return the density after an interval, None where volumes do not serve or a uniform grid, which may move, is better."""
     if window.closed:
@@ -244,7 +234,7 @@ def contracted(
     ends, start, length = ends_of(values, window), interval.start, interval.length
     drift = drift_along(prepared, window, ends, start)
     width, speed = float(ends[1] - ends[0]), 0.5 * float(np.ptp(drift)) if moving else float(np.max(np.abs(drift)))
-    fine = window.size > lw.LARGEST and np.pi * speed * length > FINE * window.spacing
+    fine = window.size > lw.LARGEST and np.pi * speed * length > TURNING_OF_LARGE_GRID * window.spacing
     # The noise of the logarithm of a state grows without limit towards a natural end.
     noise = float(np.max(covariance_at(prepared.system, window.points, start, prepared.theta.real)))
     rounding = ROUNDING * 0.5 * (np.pi / window.spacing) ** 2 * noise * length
@@ -267,16 +257,16 @@ def contracted(
             return None
         if leak is not None:
             plan = plan._replace(cells=plan.cells.reaching(*leak))
-        stiff = stiff_noise or speed * length > STIFF * width
+        stiff = stiff_noise or speed * length > TURNING * width
         far = (plan.flow.travel > MOST_TRAVEL and not moving) or plan.flow.deviations > MOST_DEVIATIONS
-        if not (general or stiff or far) or width < NARROWEST * plan.finest:  # sharper than the cells where it begins
+        if not (general or stiff or far) or width < NARROWEST_IN_CELLS * plan.finest:  # sharper than the cells where it begins
             return None
         result = advanced_by(prepared, density, plan, interval, allowed)
         if result is None:
             return None
         masses, cells, gained, error = result
         after = np.abs((masses / cells.widths).real)
-        if max(after[0], after[-1]) <= max(EDGE, unresolved) * np.max(after):
+        if max(after[0], after[-1]) <= max(EDGE_OF_CELLS, unresolved) * np.max(after):
             break
     else:  # the cells do not hold it
         return None
@@ -297,19 +287,13 @@ class Settled(NamedTuple):
 
 
 def advanced_by(
-    prepared: Prepared,
-    density: Callable[[Array], Array],
-    plan: CellPlan,
-    interval: TimeInterval,
-    allowed: float,
+    prepared: Prepared, density: Callable[[Array], Array], plan: CellPlan, interval: TimeInterval, allowed: float
 ) -> Settled | None:
     """Return the masses of cells after an interval, None where they do not settle.
 
     Args:
-        prepared: the system.
         density: the density before, as a function of offsets (J,).
         plan: the plan of the cells.
-        interval: the interval.
         allowed: the error at which more cells are not tried.
     """
 
@@ -349,11 +333,9 @@ def pulled_back(
     """Return the expectation of a function of the state after an interval, given the state before; None where it does not settle.
 
     Args:
-        prepared: the system.
         log_values: the logarithm of the function at offsets (J,).
         density: the density before the interval, as a function of offsets (J,).
         plan: the plan of the cells, None where there is none.
-        interval: the interval.
     """
     if plan is None:
         return None

@@ -12,23 +12,22 @@ depend on t, it is a product of transitions with those at the middles of substep
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from zakai.densities import IntervalDensity
 from zakai.methods._protocol import Backward, Info
 from zakai.methods.line.backward import accuracy
 from zakai.methods.line.backward_interval import negligible, smoothing_tolerance
 from zakai.methods.line.coefficients import coefficients, covariance_at, resolved_parts
-from zakai.methods.line.message import SURE, Message, points_of
+from zakai.methods.line.message import SURE_OF_DENSITY, Message, points_of
 from zakai.methods.line.prepared import NOISE, Prepared, TimeInterval
 from zakai.methods.line.update import factor_at_end
 from zakai.methods.line.volumes import cell_plan_of, pulled_back
 from zakai.methods.reflecting import filter as reflecting_filter
 from zakai.methods.reflecting.elements import (
-    SIZES,
+    ELEMENT_SIZES,
     apart,
     decomposed,
     domain_of,
@@ -43,19 +42,16 @@ from zakai.methods.reflecting.elements import (
     weighted,
 )
 from zakai.methods.reflecting.filter import State
-from zakai.numerics.complex_step import Number
+from zakai.numerics.arrays import Array, Number
 from zakai.numerics.line import window as lw
-from zakai.numerics.line.backward import ROUNDING
+from zakai.numerics.line.backward import SMALLEST
 from zakai.numerics.line.density import support
-from zakai.numerics.line.resolution import ROUNDING as PRECISION
-from zakai.numerics.line.resolution import SMOOTHER_SHARE, SUPPORT
+from zakai.numerics.line.resolution import ROUNDING, SMOOTHER_SHARE, SUPPORT
 from zakai.numerics.lobatto import Element
-
-Array = NDArray[Any]
 
 PIECE = 10.0  # standard deviations of the noise in which states at the end share a transition
 RESOLVING = 3.7  # points in a standard deviation
-RESOLVED = 1e-6  # Legendre coefficient of a density that the points of the transition resolve
+RESOLVED_DENSITY = 1e-6  # Legendre coefficient of a density that the points of the transition resolve
 FINE = 4  # points in a spacing between which a distribution is interpolated
 SUBSTEPS = 4  # of a part in which the coefficients are polynomials of time
 
@@ -84,8 +80,8 @@ def draw(
         near = np.abs(drift[(x >= first - wide) & (x <= last + wide)])
         reach = wide + length * float(np.max(near, initial=0.0))
         lower, upper = max(first - reach, low), min(last + reach, high)
-        needed = RESOLVING * 2.0 * float(np.max(element_of(prepared, lower, upper, SIZES[0]).halves)) / deviation
-        piece = element_of(prepared, lower, upper, next((size for size in SIZES if size >= needed), SIZES[-1]))
+        needed = RESOLVING * 2.0 * float(np.max(element_of(prepared, lower, upper, ELEMENT_SIZES[0]).halves)) / deviation
+        piece = element_of(prepared, lower, upper, next((size for size in ELEMENT_SIZES if size >= needed), ELEMENT_SIZES[-1]))
         result[places] = _drawn(prepared, k, piece, z[places], observed, state, uniform[places])
     return np.clip(result, domain_of(prepared).lower, domain_of(prepared).upper)[:, None], 0.0
 
@@ -97,7 +93,7 @@ def _drawn(prepared: Prepared, k: int, piece: Element, z: Array, observed: np.nd
     likely = piece.interpolation(z) @ _transition(prepared, k, piece, before, observed)
     fine = np.linspace(max(piece.lower, own.lower), min(piece.upper, own.upper), FINE * max(len(before), len(values)) + 1)
     middles = 0.5 * (fine[1:] + fine[:-1])
-    if piece.unresolved(before * piece.weights) < RESOLVED:
+    if piece.unresolved(before * piece.weights) < RESOLVED_DENSITY:
         mass = (likely * before) @ piece.interpolation(middles).T
     else:
         mass = likely @ piece.interpolation(middles).T * own.at(values, middles)
@@ -155,7 +151,7 @@ class _Product(NamedTuple):
 
 def _product(prepared: Prepared, state: State, message: Message) -> _Product:
     element, values = state.element, np.asarray(state.values).real
-    floor = SURE * (NOISE + element.unresolved(values)) * np.max(values / element.weights)
+    floor = SURE_OF_DENSITY * (NOISE + element.unresolved(values)) * np.max(values / element.weights)
 
     def logs(x: Array) -> Array:
         density = element.at(values, x)
@@ -207,9 +203,7 @@ def step(prepared: Prepared, k: int, message: Message, observed: np.ndarray, sta
     return result._replace(error=result.error + retained * message.error)
 
 
-def _by_modes(
-    prepared: Prepared, message: Message, interval: TimeInterval, state: State
-) -> Message | None:
+def _by_modes(prepared: Prepared, message: Message, interval: TimeInterval, state: State) -> Message | None:
     """Return the message at the start of an interval by the modes of the operator, None where they do not serve.
 
         b(start) = U exp(-tau lambda) U' s b(stop) / s
@@ -229,7 +223,7 @@ def _by_modes(
     top = float(np.max(logs))
     constant: Number = 0.0
     weights = after.weights * np.exp(logs - top)
-    for size in SIZES[1:]:
+    for size in ELEMENT_SIZES[1:]:
         element = element_of(prepared, lower, upper, size)
         known = decomposed(prepared, element)
         if known is None:
@@ -242,7 +236,7 @@ def _by_modes(
         propagated = modes.decayed(psi, length)
         at, log_s, scaled = element.interpolation(own.points), modes.top - known.logs, propagated / root
         own_weights = np.abs(values) * np.exp(at @ log_s)
-        wrong = max(PRECISION * float(np.exp(-length * modes.rates[0])), element.unresolved(propagated * root))
+        wrong = max(ROUNDING * float(np.exp(-length * modes.rates[0])), element.unresolved(propagated * root))
         wrong = wrong * max(float(np.sqrt(psi @ psi)), float(np.max(np.abs(scaled))))
         error = wrong * float(np.sum(own_weights)) / float(own_weights @ (at @ scaled))
         if 0.0 <= error < SMOOTHER_SHARE * smoothing_tolerance(prepared):
@@ -257,9 +251,7 @@ def _by_modes(
     return _on(prepared, state, expectation, top + float(constant.real), error)
 
 
-def _by_volumes(
-    prepared: Prepared, message: Message, interval: TimeInterval, state: State
-) -> Message:
+def _by_volumes(prepared: Prepared, message: Message, interval: TimeInterval, state: State) -> Message:
     """Return the message at the start of an interval by finite volumes."""
     element, values = state.element, np.asarray(state.values).real
     ends, (mean, variance) = np.array([0.0, element.upper - element.lower]), message.moments
@@ -279,7 +271,7 @@ def _on(prepared: Prepared, state: State, expectation: Callable[[Array], Array],
     """Return a message by its values, of some scale, where the density is."""
     window = _window(prepared, float(state.lower), float(state.upper))
     values = expectation(np.clip(window.points, state.lower, state.upper))
-    logs = np.log(np.maximum(values, ROUNDING * np.max(values))) + log_scale
+    logs = np.log(np.maximum(values, SMALLEST * np.max(values))) + log_scale
     return Message.of(logs, window, window.spacing, error)
 
 

@@ -11,10 +11,9 @@ ends (`line/volumes.py`) take the other intervals.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from zakai.errors import InputError
 from zakai.methods.line.cache import Derived
@@ -23,19 +22,17 @@ from zakai.methods.line.prepared import Prepared, TimeInterval
 from zakai.methods.line.report import Report
 from zakai.methods.line.volumes import advanced_by, cell_plan_of, kinks_between
 from zakai.models.domain import Interval
-from zakai.numerics.complex_step import Number
+from zakai.numerics.arrays import Array, Number
 from zakai.numerics.line.averages import GAUSS_NODES, GAUSS_WEIGHTS
 from zakai.numerics.line.grid_choice import DEPTH, WIDENING
 from zakai.numerics.line.operator import Spectral
 from zakai.numerics.line.resolution import RESOLVED, TRANSITION_SHARE, rounding_bound
 from zakai.numerics.lobatto import Element
 
-Array = NDArray[Any]
-
-SIZES = (24, 32, 48, 64, 96, 128, 192, 256)
-SIZES_OF_PRIORS = (*SIZES, 512, 1024)  # of which no operator is decomposed
+ELEMENT_SIZES = (24, 32, 48, 64, 96, 128, 192, 256)
+SIZES_OF_PRIORS = (*ELEMENT_SIZES, 512, 1024)  # of which no operator is decomposed
 SAMPLES = 1001  # points at which the place of a density is sought
-MARGIN = 0.02  # of the length of an element, within which of its end a kink does not count
+MARGIN_OF_KINK = 0.02  # of the length of an element, within which of its end a kink does not count
 BESIDE = 1e-6  # the same for an end of the domain
 
 
@@ -50,8 +47,8 @@ def element_of(prepared: Prepared, lower: float, upper: float, size: int) -> Ele
     unit, width, domain = 2.0 ** np.ceil(np.log2(upper - lower)), upper - lower, domain_of(prepared)
     low, high = float(unit * np.floor(lower / unit)), float(unit * np.ceil(upper / unit))
     known = prepared.once(Derived.KINKS, (low, high), lambda: kinks_between(prepared, low, high, prepared.model.start).tolist())
-    first = lower + width * (BESIDE if lower <= domain.lower else MARGIN)
-    last = upper - width * (BESIDE if upper >= domain.upper else MARGIN)
+    first = lower + width * (BESIDE if lower <= domain.lower else MARGIN_OF_KINK)
+    last = upper - width * (BESIDE if upper >= domain.upper else MARGIN_OF_KINK)
     return Element(lower, upper, size, tuple(kink for kink in known if first < kink < last))
 
 
@@ -97,7 +94,7 @@ def sampled(
     lower: float,
     upper: float,
     negligible: float,
-    sizes: tuple[int, ...] = SIZES,
+    sizes: tuple[int, ...] = ELEMENT_SIZES,
 ) -> tuple[Element, Array]:
     """Return the fewest points that resolve a density, and its probabilities there."""
     for size in sizes:
@@ -196,7 +193,7 @@ def moments(values: Array, element: Element) -> tuple[Number, Number]:
 
 
 COUNTS = 1e-14  # density relative to the maximum beyond which it is rounding
-EDGE = 1e-12  # density at an end that is not one of the domain, relative to the maximum
+EDGE_OF_ELEMENT = 1e-12  # density at an end that is not one of the domain, relative to the maximum
 TRIALS = 24  # elements that are tried
 MOST_PARTS = 64  # of an interval that the volumes do not take as a whole
 PEAK = 1.5  # points in a standard deviation of the noise with which the first element begins
@@ -228,9 +225,9 @@ def _by_modes(
     counts = np.flatnonzero((values / element.weights).real > COUNTS * np.max((values / element.weights).real))
     low, high = element.points[[max(counts[0] - 1, 0), min(counts[-1] + 1, len(values) - 1)]]
     lower, upper = apart(float(low - WIDENING * noise[1]), float(high + WIDENING * noise[1]), domain)
-    longest = float(np.max(element_of(prepared, lower, upper, SIZES[0]).halves))
+    longest = float(np.max(element_of(prepared, lower, upper, ELEMENT_SIZES[0]).halves))
     needed = min(2.0 * PEAK * longest / max(noise[0], 1e-300), element.size * longest / float(np.max(element.halves)))
-    size = next((size for size in SIZES if size >= min(needed, SIZES[4])), SIZES[-1])
+    size = next((size for size in ELEMENT_SIZES if size >= min(needed, ELEMENT_SIZES[4])), ELEMENT_SIZES[-1])
     for _ in range(TRIALS):
         new = element_of(prepared, lower, upper, size)
         offset: Number = 0.0
@@ -251,9 +248,9 @@ def _by_modes(
             growth = float(np.sum(raised) / np.sum(result.real))
         coarse = unresolved > negligible
         # Oscillations of what is not resolved reach the ends as well.
-        left, right = (float(end) > (unresolved if coarse else EDGE) for end in reached(result, new, domain))
-        if coarse and size < SIZES[-1]:
-            size = SIZES[SIZES.index(size) + 1]
+        left, right = (float(end) > (unresolved if coarse else EDGE_OF_ELEMENT) for end in reached(result, new, domain))
+        if coarse and size < ELEMENT_SIZES[-1]:
+            size = ELEMENT_SIZES[ELEMENT_SIZES.index(size) + 1]
         elif coarse:
             return None
         elif left or right:

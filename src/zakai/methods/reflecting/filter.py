@@ -8,10 +8,9 @@ The points cover the part of the domain in which the density is; at an end that 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from zakai.densities import IntervalDensity
 from zakai.errors import InputError
@@ -21,8 +20,8 @@ from zakai.methods.line.prepared import NOISE, Prepared
 from zakai.methods.line.report import Report
 from zakai.methods.line.update import error_remainder, factor_at_end, outside_tables, spread
 from zakai.methods.reflecting.elements import (
+    ELEMENT_SIZES,
     SAMPLES,
-    SIZES,
     SIZES_OF_PRIORS,
     domain_of,
     element_of,
@@ -38,13 +37,11 @@ from zakai.methods.reflecting.elements import (
 )
 from zakai.models.numeric import numpy_function
 from zakai.models.prior import DensityPrior, Prior
-from zakai.numerics.complex_step import Number
+from zakai.numerics.arrays import Array, Number
 from zakai.numerics.line.grid_choice import DEPTH
 from zakai.numerics.line.product import General, Likelihood, normalized, place
 from zakai.numerics.lobatto import Element
 from zakai.numerics.prior_grid import mixture_log_density, prior_grid
-
-Array = NDArray[Any]
 
 DEPTH_OF_PRODUCT = 70.0  # logarithm of the density below its maximum, from which a product does not come
 
@@ -131,7 +128,7 @@ def _multiplied(
         if ends is not None:
             low, high = with_margin(element.lower + ends[0], element.lower + ends[1], domain)
             low, high = max(low, element.lower), min(high, element.upper)
-            for size in SIZES:
+            for size in ELEMENT_SIZES:
                 new = element_of(prepared, low, high, size)
                 density = element.at(values, new.points)
                 result, gained, depth, growth = product()

@@ -10,18 +10,17 @@ A decomposition acts on psi = F e^s b on a longer grid, with an F that falls to 
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numba import boolean, float64, int64, types
-from numpy.typing import NDArray
 
+from zakai.numerics.arrays import Array
 from zakai.numerics.compiled import helper, kernel
 from zakai.numerics.line.averages import AVERAGES, EARLY, LATE, MEAN, MOST_MAGNUS, WHOLE, averaged, averaging, operators
 from zakai.numerics.line.density import circular_moments, highest_of, moments, shifted, spectrum, support, waves
 from zakai.numerics.line.modes import decayed, propagate
-from zakai.numerics.line.resolution import ROUNDING as PRECISION
-from zakai.numerics.line.resolution import SMOOTHER_SHARE
+from zakai.numerics.line.resolution import ROUNDING, SMOOTHER_SHARE
 from zakai.numerics.line.splitting import STEEPEST, Filtering, differences, residual, split
 from zakai.numerics.line.steps import (
     CONSTANTS_TYPE,
@@ -38,11 +37,9 @@ from zakai.numerics.line.steps import (
 )
 from zakai.numerics.line.window import CUT
 
-Array = NDArray[Any]
-
 UNRESOLVED = 1e-5  # spectrum of a smoothed density at the highest frequencies up to which sums over the points are integrals
 FEWEST = 12  # points of a message
-ROUNDING = 1e-15  # of the maximum: smaller values of psi count as this
+SMALLEST = 1e-15  # of the maximum: smaller values of psi count as this
 SURE = 100.0  # errors of psi from which its small values count
 LEAST = 1e-11  # of the maximum: the same
 LOG_MASS, MEAN_AT, VARIANCE, ALIASING, EDGE, ERROR = range(6)  # what is reported of a smoothed density
@@ -215,15 +212,15 @@ def _decomposed(
         between, decay = spread(b, first, last), decayed(rates, tau)
         propagate(modes, decay, propagated)
         highest = propagated[highest_of(propagated)]
-        noise = PRECISION * np.sqrt(norm) * max(1.0, decay[0])
+        noise = ROUNDING * np.sqrt(norm) * max(1.0, decay[0])
         left, right, _, _, _, aliasing, _, _, _ = spectrum(propagated, CUT, CUT, long_cosines, long_sines, False)
-        level = max(noise, (ROUNDING + 2.0 * aliasing) * highest)
+        level = max(noise, (SMALLEST + 2.0 * aliasing) * highest)
         # b relative to where its product with the density is largest.
         density, least = densities[i], floors[i] * densities[i, highest_of(densities[i])]
         reference, weight, total = -np.inf, 0.0, 0.0
         for j in range(size):
             if density[j] > least:
-                inner = max(propagated[place + stride * j], ROUNDING * highest)
+                inner = max(propagated[place + stride * j], SMALLEST * highest)
                 reference = max(reference, np.log(inner * density[j]) - gauge[place + stride * j])
         if not (-np.inf < reference < np.inf):
             return completed, error, scale, reliable
@@ -231,7 +228,7 @@ def _decomposed(
             b[j] = 0.0
             if density[j] > least:
                 ratio = np.exp(-gauge[place + stride * j] - reference)
-                b[j] = max(propagated[place + stride * j], ROUNDING * highest) * ratio
+                b[j] = max(propagated[place + stride * j], SMALLEST * highest) * ratio
                 weight += density[j] * ratio
                 total += density[j] * b[j]
         made = level * weight / total + (0.0 if closed else 10.0 * max(left, right))
@@ -276,7 +273,7 @@ def by_modes(
         small, peak = np.flatnonzero(psi <= least), gauged.place + gauged.stride * int(np.argmax(products[count - completed]))
         first = int(np.max(small, where=small < peak, initial=-1)) + 1
         last = int(np.min(small, where=small > peak, initial=len(psi))) - 1
-    psi = np.maximum(psi, ROUNDING)
+    psi = np.maximum(psi, SMALLEST)
     result = Message(psi, scale, first, last, 0, error, message.product)
     return BackwardSteps(result, completed, products[count - completed :], out[count - completed :])
 
@@ -310,8 +307,6 @@ def _split(
         values: b (N,).
         product: the smoothed density (N,) at the end.
         table: the terms of f and h at the points.
-        c: the coefficients of the interval.
-        averages: the weights of averages.
         places: the point of which exponents are differences, and the first and the last point of b.
         shape: the spacing, and whether the grid goes around the circle.
         accuracy: the depth of the tails and the largest error.

@@ -14,20 +14,18 @@ into the tails.  Else it is a filter that is exact for band-limited densities, w
 from __future__ import annotations
 
 from math import erfc
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numba import complex128, float64, int64
-from numpy.typing import NDArray
 
+from zakai.numerics.arrays import Array, Number
 from zakai.numerics.compiled import helper, kernel
-from zakai.numerics.complex_step import Number
 from zakai.numerics.exponentials import exponentiate
 from zakai.numerics.line.density import highest_of
 from zakai.numerics.line.steps import Transition, failed
 from zakai.numerics.transition import Transition as LinearTransition
 
-Array = NDArray[Any]
 
 class Channel(NamedTuple):
     """The kernel for given inputs: a, b, V, k0, k1, k2."""
@@ -226,7 +224,6 @@ def convolved(
         phi: phi (N,).
         channel: a, b, V, k0, k1, k2.
         middle: the point of the index N // 2, relative to the origin of the kernel.
-        spacing: the spacing of the grid.
         finest: the smallest spacing that may be asked for.
         depth: the depth of the tails, as a logarithm below the maximum, to which filters are accurate.
         closed: whether the grid goes around the circle.

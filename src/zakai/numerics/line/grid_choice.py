@@ -7,16 +7,14 @@ in a spacing, and by polynomials through eight of them between: the values of h,
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from zakai.numerics.arrays import Array
 from zakai.numerics.compiled import helper
 from zakai.numerics.line.density import highest_of
 from zakai.numerics.line.window import ALIGNMENT, SIZES, SMALL, STENCIL_WEIGHTS
-
-Array = NDArray[Any]
 
 PER = 8  # points of rows in a spacing of the grid
 _STENCIL = len(STENCIL_WEIGHTS)
@@ -100,9 +98,7 @@ def _surveyed(
 
 
 @helper
-def placed(
-    logs: Array, first: int, last: int, likelihood: Likelihood
-) -> tuple[float, float, float]:
+def placed(logs: Array, first: int, last: int, likelihood: Likelihood) -> tuple[float, float, float]:
     """Return the range of the product as indices of the grid, and the narrowest cell in it; NaN where there are too many.
 
     Cells whose bound is far below the largest value are left out, and the others divided until the likelihood hardly changes.
@@ -110,7 +106,6 @@ def placed(
     Args:
         logs: the logarithm of the density (N,).
         first, last: the points between which it is not negligible.
-        likelihood: the likelihood.
     """
     left, width, level, best = np.empty(MOST_CELLS), np.empty(MOST_CELLS), np.empty((MOST_CELLS, 3)), -np.inf
     weights, h, count, done = np.empty(_STENCIL), np.empty(likelihood.rows.shape[0]), last - first, 0
@@ -198,7 +193,6 @@ def sampled(
         q: the density (N,) on a coarse grid.
         ends: the points between which it is not negligible.
         grid: the first point of the coarse grid, its spacing, and the unit of spacings.
-        likelihood: the likelihood.
         density: receives the density (n,).
         b: receives the logarithm (n,).
 

@@ -16,8 +16,8 @@ from typing import Any
 
 import numpy as np
 from numba import float64, int64, types
-from numpy.typing import NDArray
 
+from zakai.numerics.arrays import Array
 from zakai.numerics.compiled import kernel
 from zakai.numerics.line.averages import AVERAGES, WHOLE
 from zakai.numerics.line.density import circular_rows, highest_of, moments, separated, shifted, spectrum, support, waves
@@ -32,7 +32,6 @@ from zakai.numerics.line.steps import (
     FAILED,
     GRID_TYPE,
     KERNEL,
-    MARGIN,
     OK,
     PHI,
     RANGE,
@@ -42,6 +41,7 @@ from zakai.numerics.line.steps import (
     STATUSES,
     STEPS_TYPE,
     TABLE,
+    TABLE_MARGIN,
     UNRESOLVED,
     Coefficients,
     Constants,
@@ -61,8 +61,6 @@ from zakai.numerics.line.steps import (
     product,
 )
 from zakai.numerics.line.window import ALIGNMENT, CUT
-
-Array = NDArray[Any]
 
 COARSE = 1e-5  # spectrum of a product at the highest frequencies from which a somewhat finer grid does not serve
 _V, _M = float64[::1], float64[:, ::1]
@@ -87,7 +85,7 @@ def _loop(kernels: bool, splits: bool, varying: bool, samples: bool, weak: bool,
         averages, cosines, sines = known
         densities, out = results
         negligible, most, generous, size, length = limits[0], limits[1], limits[4], values.size, table.shape[3]
-        half, timed, near = size // 2, table.shape[0] > 1, length == size + 2 * MARGIN
+        half, timed, near = size // 2, table.shape[0] > 1, length == size + 2 * TABLE_MARGIN
         density, local = values.copy(), np.empty((table.shape[1], table.shape[2], size))
         b, change, channel, answer = np.empty(size), np.empty(size), np.empty(6), out[-1]
         channel[0] = np.nan
@@ -120,7 +118,7 @@ def _loop(kernels: bool, splits: bool, varying: bool, samples: bool, weak: bool,
                     break
                 if first < 0 or last > size - 1:
                     by = ALIGNMENT * int(np.floor((0.5 * (first + last) - half) / ALIGNMENT + 0.5))
-                    if abs(by) > length or start + by < 0 or start + by + size > length or (near and abs(by) > MARGIN // 2):
+                    if abs(by) > length or start + by < 0 or start + by + size > length or (near and abs(by) > TABLE_MARGIN // 2):
                         status = RANGE
                         break
                     density = shifted(density, by)
@@ -206,7 +204,7 @@ def _loop(kernels: bool, splits: bool, varying: bool, samples: bool, weak: bool,
                 status = AFTER
             elif closed:
                 status = AFTER if size > generous and size > 2.2 * size / resolving else OK
-            elif near and abs(start - MARGIN) > MARGIN // 3:
+            elif near and abs(start - TABLE_MARGIN) > TABLE_MARGIN // 3:
                 status = TABLE
             if status != OK:
                 break
@@ -233,7 +231,6 @@ def advance(
     Args:
         mechanisms: what the steps may need.
         state: where the steps begin.
-        grid: the grid.
         steps: the intervals, of which `first` is the first that is taken.
         observed: what is observed in the intervals from there on (K, m), zero where nothing is.
         limits: what a step must keep, as the fields of `Limits`.

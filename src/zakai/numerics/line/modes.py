@@ -16,12 +16,12 @@ grid that resolves this deviation serve, and the product with the likelihood has
 from __future__ import annotations
 
 from math import erfc
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numba import float64, void
-from numpy.typing import NDArray
 
+from zakai.numerics.arrays import Array
 from zakai.numerics.compiled import helper, kernel
 from zakai.numerics.exponentials import exponentiate
 from zakai.numerics.line.density import highest_of
@@ -38,8 +38,6 @@ from zakai.numerics.line.resolution import (
 )
 from zakai.numerics.line.steps import FAILED, GRID, OK, RANGE
 from zakai.numerics.line.window import CUT, LARGEST
-
-Array = NDArray[Any]
 
 _V = float64[::1]
 
@@ -133,7 +131,6 @@ def carried(
         density: the density (n,) before.
         at: its points as indices of the grid of the modes.
         shape: whether these are the points of the grid of the modes, and whether it goes around the circle.
-        known: the modes.
         tau: the length of the interval.
         ends: the points between which the density is retained.
         most: the largest error.

@@ -9,12 +9,12 @@ Else the product with the likelihood has a fine grid of its own (`numerics/line/
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numba import boolean, float64, int64, types
-from numpy.typing import NDArray
 
+from zakai.numerics.arrays import Array
 from zakai.numerics.compiled import helper, kernel
 from zakai.numerics.line.density import highest_of, moments, separated, spectrum, support
 from zakai.numerics.line.grid_choice import PER, Likelihood, Outlook, differences, log_likelihood, outlook, place_of, sampled
@@ -23,8 +23,6 @@ from zakai.numerics.line.product import WEAK_SHARE, weak_error
 from zakai.numerics.line.resolution import RELIABLE, SPECTRUM_FACTOR, step_error
 from zakai.numerics.line.steps import AFTER, BROAD, FAILED, GRID, NARROW, OK, RANGE, SIZE, UNRESOLVED, product
 from zakai.numerics.line.window import CUT
-
-Array = NDArray[Any]
 
 _V, _M, _T = float64[::1], float64[:, ::1], float64[:, :, ::1]
 

@@ -15,12 +15,11 @@ from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from zakai.numerics.arrays import Array
 from zakai.numerics.complex_step import real_product
 from zakai.numerics.line.resolution import ROUNDING
 
-Array = NDArray[Any]
 
 @lru_cache(maxsize=64)
 def derivatives(size: int, closed: bool) -> tuple[Array, Array]:
@@ -122,7 +121,6 @@ def symmetric(closed: bool, spacing: float, covariance: Array, potential: Array)
 
     Args:
         closed: whether the grid goes around the circle.
-        spacing: its spacing.
         covariance: G, one number, or its values between the points: (N + 1,) half a spacing below and above each, (N,) below
             each on the circle.
         potential: V at the points (N,).

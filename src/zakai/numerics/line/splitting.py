@@ -24,12 +24,12 @@ There the coefficients are complex: their imaginary parts are the derivatives, i
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numba import float64, int64, void
-from numpy.typing import NDArray
 
+from zakai.numerics.arrays import Array
 from zakai.numerics.compiled import helper, kernel
 from zakai.numerics.complex_step import STEP
 from zakai.numerics.exponentials import exponentiate
@@ -37,8 +37,6 @@ from zakai.numerics.line.averages import AVERAGES, EARLY, LATE, MEAN, MOST_MAGNU
 from zakai.numerics.line.density import highest_of, moments
 from zakai.numerics.line.gaussian_kernels import filtered, narrow_taps, taps_of, wrapped
 from zakai.numerics.line.steps import CELL, DRIFT, IMPOSSIBLE, OBSERVED, OVERFLOW, SLOPE, Coefficients, Transition, failed
-
-Array = NDArray[Any]
 
 MOST_SUBSTEPS = 64
 STEEPEST = 0.5  # change of exponents between points for which the filter of a narrow kernel is accurate
@@ -79,9 +77,7 @@ def divided(
     Args:
         density: the density (N,).
         table: see `steps.Grid`.
-        c: the coefficients of the interval.
         averages: the weights of `line/averages.py`.
-        spacing: the spacing of the grid.
         closed: whether it goes around the circle.
         varying: whether the coefficients vary within the interval.
         accuracy: what is asked of the result.

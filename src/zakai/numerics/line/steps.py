@@ -9,19 +9,17 @@ f, f' and h.  The functions of an interval are sums of terms with factors that d
 from __future__ import annotations
 
 from enum import Enum
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numba import float64, int64, types
-from numpy.typing import NDArray
 
+from zakai.numerics.arrays import Array
 from zakai.numerics.compiled import helper
 from zakai.numerics.exponentials import exponentiate
 from zakai.numerics.line.density import spectrum
 from zakai.numerics.line.grid_choice import FAR, log_likelihood
 from zakai.numerics.line.resolution import SPECTRUM_FACTOR
-
-Array = NDArray[Any]
 
 COLUMNS = (
     "gained", "mean", "variance", "aliasing", "edge", "negative", "time", "depth", "growth", "made", "error", "log_floor",
@@ -29,7 +27,7 @@ COLUMNS = (
 )  # fmt: skip
 # The transition: whole with a sample after it, split with increments inside, whole with increments inside, split with a sample.
 FACTOR, SPLIT, KERNEL, SPLIT_FACTOR = 0, 1, 2, 3
-MARGIN = 96  # points of a table of coefficients in time beyond the grid, of which a third may be used before it is made again
+TABLE_MARGIN = 96  # points of a table of coefficients in time beyond the grid; a third may be used before it is made again
 
 
 class Status(Enum):

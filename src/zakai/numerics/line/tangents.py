@@ -13,21 +13,19 @@ term,
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numba import float64, void
-from numpy.typing import NDArray
 from scipy.special import erfc
 
+from zakai.numerics.arrays import Array
 from zakai.numerics.compiled import kernel
 from zakai.numerics.complex_step import STEP
 from zakai.numerics.line.modes import FALL
 from zakai.numerics.line.operator import FourierOperator, Generator, Spectral, derivatives, exponential_of, quotients
 from zakai.numerics.line.resolution import ROUNDING
 from zakai.numerics.line.window import CUT, SMALL, Window, density_at, gathered, interpolated, local_polynomial
-
-Array = NDArray[Any]
 
 TERMS = 40
 PART = 3.0  # norm up to which one Taylor series is summed
@@ -42,7 +40,6 @@ def exponential_tangents(
     """Return exp(L) u and its derivatives (p, N).
 
     Args:
-        window: the grid.
         coefficients: those of L.
         changed: the same at p parameters with infinitesimal imaginary parts.
         values: u (N,).

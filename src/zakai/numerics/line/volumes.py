@@ -12,18 +12,16 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numba import complex128, float64, int64
-from numpy.typing import NDArray
 
+from zakai.numerics.arrays import Array, Number
 from zakai.numerics.compiled import helper, kernel
-from zakai.numerics.complex_step import Number
 from zakai.numerics.line import window as lw
 from zakai.numerics.line.window import interpolated_logs
 
-Array = NDArray[Any]
 Bands = tuple[Array, Array, Array]
 
 _COUNTS = (1, 2, 3, 4, 6)  # steps of implicit Euler that are extrapolated

@@ -12,14 +12,12 @@ from functools import lru_cache
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from zakai.numerics.arrays import Array
 from zakai.numerics.complex_step import angle, is_complex, real_product
 from zakai.numerics.line.density import spectrum, spectrum_of_many, waves
 from zakai.numerics.line.operator import FourierOperator, generator
 from zakai.numerics.line.resolution import NEGLIGIBLE, SPECTRUM_FACTOR
-
-Array = NDArray[Any]
 
 _STENCIL = np.arange(-3, 5)
 STENCIL_WEIGHTS = np.array([1.0 / np.prod([float(i - j) for j in _STENCIL if j != i]) for i in _STENCIL])
@@ -64,7 +62,7 @@ LARGE = 1024  # points of a grid on which matrices propagate messages, and kerne
 CUT = 1e-13  # density relative to its maximum that a new grid must hold
 DEEP = 1e-20  # the same of densities whose small values are accurate
 SMALL = 1e-8  # density relative to its maximum below which its logarithm is interpolated
-TOGETHER = 256  # points at which values of a large grid are interpolated together
+POINTS_TOGETHER = 256  # points at which values of a large grid are interpolated together
 ALIGNMENT = 8  # centres are at multiples of so many spacings
 
 
@@ -198,7 +196,6 @@ def fitted(check: GridCheck, window: Window, most: int = LARGEST, generous: int 
 
     Args:
         check: the figures of the density.
-        window: its grid.
         most: the largest size.
         generous: a grid of up to so many points is kept though fewer would do.
         margin: range of a new grid beyond that of the density, relative to it.
@@ -254,8 +251,8 @@ def refined(window: Window, factor: float = 2**0.5) -> Window:
 
 def interpolated(values: Array, window: Window, offsets: Array) -> Array:
     """Return the interpolants of values (..., N) at offsets (J,) from the origin."""
-    if len(offsets) > TOGETHER and window.size > LARGE:
-        parts = np.array_split(offsets, -(-len(offsets) // TOGETHER))
+    if len(offsets) > POINTS_TOGETHER and window.size > LARGE:
+        parts = np.array_split(offsets, -(-len(offsets) // POINTS_TOGETHER))
         return np.concatenate([interpolated(values, window, part) for part in parts], axis=-1)
     at = (offsets - window.centre) / window.spacing + window.size // 2
     nearest = np.round(at)
