@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.special import expit
 
+from zakai.methods.line.choice import predicted
 from zakai.methods.line.coefficients import coefficients, covariance_at, resolved_parts
 from zakai.methods.line.message import LOWEST, SURE, Message, reliable
 from zakai.methods.line.model import finite
@@ -28,7 +29,6 @@ from zakai.methods.line.transition import (
     Coefficients,
     Substep,
     Trial,
-    by_substeps,
     magnus,
     parts_of_split,
 )
@@ -191,7 +191,7 @@ def _states(prepared: Prepared, interval: TimeInterval, cuts: list[float], state
     result = [state]
     for first, last in zip(cuts[:-2], cuts[1:-1], strict=True):
         before = result[-1]
-        propagated = by_substeps(prepared, before.values, before.window, interval.part(first, last), Report())
+        propagated, _ = predicted(prepared, before.values, before.window, interval.part(first, last), Report())
         result.append(state_of(propagated.values, propagated.window, state.error, max(float(state.log_floor), LOWEST)))
     return result
 
