@@ -42,6 +42,7 @@ from zakai.numerics.line.operator import FourierOperator, exponential_of
 from zakai.numerics.line.product import finer
 from zakai.numerics.line.resolution import (
     GROSS,
+    LOST_ALIASING,
     LOST_MASS,
     SPECTRUM_FACTOR,
     TRANSITION_SHARE,
@@ -454,6 +455,8 @@ def _by_substeps(
         if prepared.smoothing and stack:  # what a kink leaves everywhere
             check = check._replace(aliasing=0.0, left=0.0, right=0.0)
         report.density(check)
+        if stack and check.aliasing > LOST_ALIASING:  # what follows means nothing, and may take many substeps
+            return Prediction(np.full_like(values, np.nan), window, np.float64(np.nan), check), 0.0
         if window != begin:  # noise that the new grid has brought, which the transition smooths before it is seen
             brought = lw.grid_check(values, window.closed, negligible).aliasing
             report.aliasing = max(report.aliasing, brought - known)
