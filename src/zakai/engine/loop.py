@@ -10,7 +10,7 @@ import numpy as np
 
 from zakai.densities import Density
 from zakai.engine.along_path import along_path, record_along
-from zakai.engine.coarser import distances
+from zakai.engine.coarser import Done, distances
 from zakai.engine.setting import KEPT, Setting
 from zakai.errors import InputError
 from zakai.methods._protocol import Infos, Prepared, State, joined, stacked
@@ -218,9 +218,20 @@ class Run:
 
         return warnings_of_run(result, self.setting.method.losses, apart)
 
-    def again(self, setting: Setting) -> Infos:
-        """Return what another setting of the method reports after each interval."""
-        return joined([one.infos for one in segments(setting, self.schedule, None, self.values)])
+    def again(self, setting: Setting, done: Done) -> Infos:
+        """Return what another setting of the method reports after each interval; `done` is called with the number of these."""
+        parts, count = list[Infos](), 0
+
+        def stepped() -> None:
+            nonlocal count
+            count += 1
+            done(count)
+
+        for one in segments(setting, self.schedule, None, self.values, 1, stepped):
+            parts.append(one.infos)
+            count = one.first + len(one.states)
+            done(count)
+        return joined(parts)
 
     def why_no_density(self) -> str:
         """Return why densities were not kept."""

@@ -19,6 +19,7 @@ from zakai.algebra.conditions import all_hold
 from zakai.algebra.theorems import conditions_of
 from zakai.densities import Density
 from zakai.engine.batch import filter_all, smooth_all
+from zakai.engine.coarser import Done
 from zakai.engine.driver import check_noise, check_records, with_inputs
 from zakai.engine.loop import CHUNK, KEPT_BYTES, Run, advance, size_of
 from zakai.engine.paths import sample_paths
@@ -285,13 +286,19 @@ class SmoothingRun(Run):
         """Return what the figures of the filter say, nothing while they stand beside those of the smoother."""
         return [] if self.start is not None else super().health_warnings(result)
 
-    def again(self, setting: Setting) -> Infos:
+    def again(self, setting: Setting, done: Done) -> Infos:
         """Return what another setting of the method reports after each interval, of the smoother once the record is smoothed."""
         if self.start is None:
-            return super().again(setting)
-        other = SmoothingRun(setting, self.record)
-        other.all()
-        other.smooth(lambda run, count: None, lambda run: None)
+            return super().again(setting, done)
+        other, count = SmoothingRun(setting, self.record), 0
+
+        def reported(run: Run, more: int) -> None:
+            nonlocal count
+            count += more
+            done(0.5 * count)  # the pass through the record is half of the work, and the way back the other half
+
+        other.all(reported)
+        other.smooth(reported, lambda run: None)
         return joined(other.parts)
 
     def complete(self, result: FilterResult) -> FilterResult:

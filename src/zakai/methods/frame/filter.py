@@ -27,7 +27,8 @@ from zakai.methods.frame.update import depth_of, update
 from zakai.methods.particles.programs import Array
 from zakai.methods.system.escape_of_states import RARE, check_escape
 from zakai.models.prior import DensityPrior
-from zakai.numerics.trains.train import Train, quasi_random
+from zakai.numerics.quasi_random import quasi_random
+from zakai.numerics.trains.train import Train
 
 PRIOR_POINTS, BLOCK = 1024, 1024
 AUDIT = 10  # intervals between comparisons of s and 2 s substeps, where the last one was within bounds

@@ -144,6 +144,8 @@ def predicted(
     prepared: Prepared, values: Array, window: lw.Window, interval: TimeInterval, report: Report
 ) -> tuple[Prediction, float]:
     """Return the density after an interval that is filtered alone, and the factor by which its kernel contracts deviations."""
+    if not np.isfinite(values.real).all():  # a density that is lost stays lost
+        return Prediction(values, window, np.float64(np.nan), None), 1.0
     kernel = kernel_of(prepared, interval, window, report)
     density = Density(prepared, values, window, interval, report, kernel)
     for mechanism in MECHANISMS:

@@ -41,6 +41,7 @@ from zakai.numerics.line.operator import FourierOperator, Generator, exponential
 from zakai.numerics.line.product import finer
 from zakai.numerics.line.resolution import (
     GROSS,
+    LOST_ALIASING,
     LOST_MASS,
     SPECTRUM_FACTOR,
     TRANSITION_SHARE,
@@ -373,6 +374,8 @@ def _by_substeps(
         if prepared.smoothing and stack:  # what a kink leaves everywhere
             check = check._replace(aliasing=0.0, left=0.0, right=0.0)
         report.density(check)
+        if stack and check.aliasing > LOST_ALIASING:  # what follows means nothing, and may take many substeps
+            return Prediction(np.full_like(values, np.nan), window, np.float64(np.nan), check), 0.0
         report.aliasing = max(report.aliasing, fitted.brought)
         report.time += trial.error + fitted.missing
         after = window if trial.substep is None else lw.translated(window, trial.substep.speed * part.length)
