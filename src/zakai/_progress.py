@@ -30,15 +30,47 @@ def shown() -> bool:
 
 
 @contextmanager
-def announced(what: str) -> Iterator[None]:
-    """Log that work takes more than `FIRST` seconds, if it does; nothing is known of its end."""
-    timer = Timer(FIRST, lambda: _LOG.warning("%s takes more than %.0f s", what, FIRST))
-    timer.daemon = True
-    timer.start()
+def announced(what: str) -> Iterator[Callable[[float, float, float], None]]:
+    """Log that work takes more than `FIRST` seconds, if it does, and how long the rest takes, as soon as that is known.
+
+    Yields a function of the parts of the work that are done, and of the fewest and the most that there usually are in all; the
+    rest is estimated from the time between its calls.
+    """
+    work = _Announced(what)
     try:
-        yield
+        yield work.advance
     finally:
-        timer.cancel()
+        work.timer.cancel()
+
+
+class _Announced:
+    def __init__(self, what: str):
+        self.what, self.known, self.lock, self.said = what, "", Lock(), False
+        self.began, self.first = time.monotonic(), (0.0, 0.0)
+        self.timer = Timer(FIRST, self._announce)
+        self.timer.daemon = True
+        self.timer.start()
+
+    def _announce(self) -> None:
+        with self.lock:
+            self.said = bool(self.known)
+            _LOG.warning("%s takes %s", self.what, self.known or f"more than {FIRST:.0f} s")
+
+    def advance(self, done: float, fewest: float, most: float) -> None:
+        """Note how much is done; log how long the rest takes, where only the beginning was announced."""
+        now = time.monotonic()
+        if not self.first[1]:
+            self.first = now, done
+        # The first part waits for what is prepared and compiled.
+        alone = done <= self.first[1]
+        rate = (now - self.began) / done if alone else (now - self.first[0]) / (done - self.first[1])
+        about = "at most about" if alone else "about"
+        low, high = (rate * max(count - done, 0) for count in (fewest, most))
+        with self.lock:
+            self.known = f"{about} {high:.0f} s more" if fewest == most else f"{about} {low:.0f} to {high:.0f} s more"
+            if now - self.began > FIRST and not self.said and high > FIRST and not alone:
+                self.said = True
+                _LOG.warning("%s takes %s", self.what, self.known)
 
 
 @contextmanager

@@ -120,3 +120,41 @@ def test_increments_over_intervals_in_which_the_state_adds_more_than_the_noise_w
     _, record = zakai.simulate(model, np.arange(1, 9) * 0.2, seed=2)
     with pytest.warns(UserWarning, match="the steps are too long for increments"):
         zakai.filter(model, record).residuals()
+
+
+POLAR = {
+    "state": ["px", "py", "v"], "drift": ["v", "-py/4 + v/5", "-v/5"],
+    "diffusion": [["0.2", "0", "0"], ["0", "0.3", "0"], ["0", "0", "0.5"]],
+    "observation": ["sqrt(px**2 + py**2)", "px*py/4"], "observation_noise": [["0.05", "0.01"], ["0.01", "0.02"]],
+    "observation_kind": "samples",
+    "prior": {"kind": "gaussian", "mean": [3, 2, 0.2], "cov": [[1, 0, 0], [0, 0.5, 0], [0, 0, 0.3]]},
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("method", ["general-direct", "tensor-train"])
+@pytest.mark.parametrize("values", [(3.1, 1.2), (5.5, 4.0)])
+def test_residuals_of_several_states_equal_sums_over_a_grid(method, values):
+    """The second coordinate is given the first, which is sharp, and their noise is correlated."""
+    filtered = zakai.filter(zakai.Model(**POLAR), zakai.Record([0.0], [values], "samples"), method)
+    found = filtered.residuals()[0]
+    px, py = np.meshgrid(3 + np.linspace(-7, 7, 1501), 2 + np.sqrt(0.5) * np.linspace(-7, 7, 1501), indexing="ij")
+    prior = norm.pdf(px, 3, 1) * norm.pdf(py, 2, np.sqrt(0.5))
+    score = (values[0] - np.hypot(px, py)) / np.sqrt(0.05)
+    given = norm.cdf((values[1] - px * py / 4 - 0.2 * np.sqrt(0.05) * score) / np.sqrt(0.02 - 0.01**2 / 0.05))
+    second = prior * norm.pdf(score)
+    expected = np.sum(prior * norm.cdf(score)) / prior.sum(), np.sum(second * given) / second.sum()
+    np.testing.assert_allclose(found, expected, atol=1.5e-3)
+    assert np.array_equal(found, filtered.residuals(seed=3)[0])
+    predicted = filtered.predict_observations()
+    np.testing.assert_allclose(predicted.quantile(found[0])[0, 0], values[0], atol=1e-9)
+
+
+@pytest.mark.parametrize("kind", ["samples", "increments"])
+def test_residuals_of_two_methods_agree_in_two_states(kind):
+    model = zakai.Model(
+        state=["x", "y"], drift=["-x/5 + y/2", "-y/3"], observation=["x*sin(x)", "x*cos(x)"], observation_kind=kind,
+        observation_noise=[["1", "0"], ["0", "1"]], prior={"kind": "gaussian", "mean": [0.5, 0], "cov": [[1, 0], [0, 1]]},
+    )  # fmt: skip
+    _, record = zakai.simulate(model, 0.1 * np.arange(1, 6), seed=5)
+    first, second = (zakai.filter(model, record, method).residuals() for method in ("general-direct", "yau-yau"))
+    np.testing.assert_allclose(first, second, atol=3e-3)

@@ -55,7 +55,7 @@ def test_the_calls_of_one_observation_come_in_the_order_of_the_page():
     )
     _, record = zakai.simulate(model, [0.3, 1.1, 1.35, 2.9], seed=1)
     listed = rows()
-    kernel = ("numerics/line/modes.py", "advance")  # compiled: no call of Python's
+    kernel = ("numerics/line/modes_loop.py", "advance")  # compiled: no call of Python's
     assert kernel in listed and "def advance(" in (SOURCE / kernel[0]).read_text()
     expected = [row for row in listed if row != kernel]
     assert len(expected) > 15

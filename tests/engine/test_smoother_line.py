@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scipy.linalg import expm
+from scipy.linalg import expm, solve_banded
+from scipy.stats import norm
 
 import zakai
 from references import graded
@@ -286,3 +287,40 @@ def test_increments_of_a_double_well_under_noise_that_depends_on_the_state():
     variance = np.array([np.sum((x - m) ** 2 * one) / np.sum(one) for m, one in zip(mean, densities, strict=True)])
     assert np.abs(smoothed.mean[:, 0] - mean).max() < 1e-6
     assert np.abs(smoothed.variance[:, 0] / variance - 1.0).max() < 1e-5
+
+
+def evidence_of_double_well(record, noise, nodes, steps):
+    """Return p(record | x at 0) at nodes (N,) for dx = (x - x^3) dt + dw, by implicit steps of the backward equation."""
+    below, above = nodes[1:-1] - nodes[:-2], nodes[2:] - nodes[1:-1]
+    drift = nodes[1:-1] - nodes[1:-1] ** 3
+    lower, upper = (1 - drift * above) / (below * (below + above)), (1 + drift * below) / (above * (below + above))
+    bands, b = np.zeros((3, len(nodes))), np.ones(len(nodes))
+    times, values = np.append(0.0, record.times), record.values[:, 0]
+    for k in range(len(values) - 1, -1, -1):
+        b, length = b * norm.pdf(values[k], nodes, np.sqrt(noise)), (times[k + 1] - times[k]) / steps
+        bands[0, 2:], bands[1], bands[2, :-2] = -length * upper, 1.0, -length * lower
+        bands[1, 1:-1] += length * (lower + upper)
+        bands[0, 1], bands[2, -2] = -1.0, -1.0  # b' is zero at the ends
+        for _ in range(steps):
+            b[[0, -1]] = 0.0
+            b = solve_banded((1, 1), bands, b)
+    return b
+
+
+@pytest.mark.parametrize("variance", [25.0, 100.0])
+def test_a_double_well_is_smoothed_from_a_broad_prior(variance):
+    model = zakai.Model(
+        state=["x"], drift=["x - x**3"], observation=["x"], observation_kind="samples", observation_noise=[["0.2"]],
+        prior={"kind": "gaussian", "mean": [0.5], "cov": [[variance]]},
+    )  # fmt: skip
+    record = zakai.Record([0.2, 0.4, 0.7], [[0.9], [1.3], [0.4]], "samples")
+    result = zakai.smooth(model, record)
+    scale = np.sqrt(variance)
+    nodes = 0.05 * np.sinh(np.linspace(-np.arcsinh(180 * scale), np.arcsinh(180 * scale), 4001))
+    coarse, fine = (evidence_of_double_well(record, 0.2, nodes, steps) for steps in (200, 400))
+    weights = (2 * fine - coarse) * norm.pdf(nodes, 0.5, scale) * np.gradient(nodes)
+    mean = weights @ nodes / weights.sum()
+    deviation = np.sqrt(weights @ (nodes - mean) ** 2 / weights.sum())
+    assert not result.warnings
+    np.testing.assert_allclose(result.mean[0, 0], mean, atol=5e-4 * scale)
+    np.testing.assert_allclose(np.sqrt(result.cov[0, 0, 0]), deviation, rtol=5e-4)

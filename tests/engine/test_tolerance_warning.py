@@ -1,10 +1,13 @@
 """Warnings say by how much the means may be off and from when on, or that the density was lost; right results are silent."""
 
+import re
+
 import numpy as np
 import pytest
 from scipy import special
 
 import zakai
+from zakai import _progress
 from zakai.notes.health import warnings_of_run
 
 
@@ -106,3 +109,14 @@ def dense(times, values, h, noise, x):
         mean = weights @ points
         moments.append((mean, np.sqrt(weights @ (points - mean) ** 2)))
     return np.array(moments).T
+
+
+@pytest.mark.parametrize("smooth", [False, True])
+def test_a_comparison_that_takes_long_says_how_long(monkeypatch, caplog, smooth):
+    monkeypatch.setattr(_progress, "FIRST", 0.001)
+    model = linear(observation=["abs(x - 0.3)"], observation_noise=[["0.0001"]])
+    values = np.tile([2.249, 2.040, 2.086, 1.415, 1.016, 0.797], 8)
+    record = zakai.Record(0.1 * np.arange(1, 49), values, "samples")
+    (zakai.smooth if smooth else zakai.filter)(model, record, "yau-yau")
+    what = "comparing with a result of tolerance=0.01, to estimate the error, takes"
+    assert re.search(what + r" (at most )?about \d+ s more", caplog.text)

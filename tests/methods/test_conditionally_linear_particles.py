@@ -221,6 +221,48 @@ def test_a_path_that_gives_the_linear_states_away_leaves_them_to_draws():
         zakai.filter(model, record, PARTICLES, split="yes")
 
 
+RATE = "exp(0.4*T)*a*b"
+REACTOR = {
+    "state": ["a", "b", "T"], "drift": [f"1 - a - {RATE}", f"1 - b - {RATE}", f"3*{RATE} - 2*T"], "observation": ["T"],
+    "diffusion": np.diag([0.05, 0.05, 0.2]), "observation_noise": [[0.01]], **SAMPLES,
+}  # fmt: skip
+
+
+def agree(result, drawn):
+    """Return whether two filters differ by less than five of their standard errors."""
+    apart = (result.mean - drawn.mean)[1:] / np.hypot(result.mean_standard_error, drawn.mean_standard_error)[1:]
+    errors = np.hypot(result.log_likelihood_standard_error, drawn.log_likelihood_standard_error)
+    return np.abs(apart).max() < 5.0 and abs(result.log_likelihood - drawn.log_likelihood) < 4 * errors
+
+
+def test_filters_whose_equations_take_more_time_than_they_save_are_left_out():
+    """The covariance of `a` needs twelve substeps an interval where `a` needs two, and `a` is a third of the error."""
+    two = [[0.4, 0.6, 0.5], [0.6, 0.4, 0.5]]
+    priors = {"kind": "gaussian", "mean": [0.5] * 3, "cov": [0.04, 0.04, 0.1]}, {
+        "kind": "mixture", "weights": [0.5, 0.5], "means": two, "covs": [np.diag([0.04, 0.04, 0.1])] * 2}  # fmt: skip
+    times = 0.3 * np.arange(1, 26)
+    record = zakai.Record(times, 0.5 + 0.1 * np.sin(times)[:, None], "samples")
+    for prior in priors:
+        model = zakai.Model(**REACTOR, prior=prior)
+        drawn = zakai.filter(model, record, PARTICLES, particles=1500, split=False)
+        for seed in range(3):
+            result = zakai.filter(model, record, PARTICLES, particles=1500, seed=seed)
+            assert (result.health["linear_states"][1:] == 0).all()
+        assert agree(result, drawn)
+        assert zakai.filter(model, record, PARTICLES, particles=500, split=True).health["linear_states"][-1] == 1
+
+
+def test_filters_are_kept_or_left_out_after_a_sample_at_the_start():
+    times = 0.25 * np.arange(12)
+    record = zakai.Record(times, 0.6 + 0.2 * np.cos(times)[:, None], "samples")
+    result = zakai.filter(zakai.Model(**MIXED), record, PARTICLES, particles=1000)
+    assert (result.health["linear_states"][1:] == 1).all()
+    # One whose path gives the linear state away.
+    model = zakai.Model(**{**MIXED, "diffusion": [["0.02", "0"], ["0", "0.5"]]})
+    result, drawn = (zakai.filter(model, record, PARTICLES, particles=3000, split=split) for split in (None, False))
+    assert (result.health["linear_states"][1:] == [1, *[0] * 11]).all() and agree(result, drawn)
+
+
 def test_a_nonlinear_law_of_the_others_goes_with_a_filter_of_the_linear_states():
     model = zakai.Model(
         state=["u", "v"], drift=["-u", "u - v"], diffusion=np.diag([1.0, 0.3]), observation=["exp(u)", "v"],

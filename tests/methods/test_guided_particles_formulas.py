@@ -84,7 +84,7 @@ def test_a_law_is_that_of_the_model_whatever_is_missing(name, missing):
     seen = np.array([j not in missing for j in range(2)])
     given = np.where(seen, values, np.nan)
     motion = Motion(system_of(model), model.theta())
-    row, counted = motion.system.law.given(np.where(seen, values, 0.0), seen, 0.7, model.theta(), None)
+    row, counted = motion.system.law.given(np.where(seen, values, 0.0), seen, motion.law_parameters(0.7, None), None)
     terms = motion.values(motion.law, X, 0.7, row)
     ours = np.where(counted[:, None] > 0, terms, 0.0).sum(axis=0)
     assert np.allclose(ours, model.observation_law.log_density(given, X.T, 0.7, model.theta()), rtol=1e-9, atol=1e-9)
@@ -93,7 +93,7 @@ def test_a_law_is_that_of_the_model_whatever_is_missing(name, missing):
 def test_a_log_density_is_a_law():
     model = model_of(observation=None, observation_log_density="-abs(z - x*y)/2 - log(4)", observed=["z"])
     motion = Motion(system_of(model), model.theta())
-    row, counted = motion.system.law.given(np.array([0.4]), np.array([True]), 0.7, model.theta(), None)
+    row, counted = motion.system.law.given(np.array([0.4]), np.array([True]), motion.law_parameters(0.7, None), None)
     expected = model.observation_law.log_density([0.4], X.T, 0.7, model.theta())
     assert counted[0] == 1 and np.allclose(motion.values(motion.law, X, 0.7, row)[0], expected)
 
@@ -104,7 +104,7 @@ def test_an_angle_with_wide_noise_has_a_density_on_the_circle():
     z = np.linspace(-np.pi, np.pi, 400, endpoint=False)
     logs = []
     for value in z:
-        row, _ = motion.system.law.given(np.array([value]), np.array([True]), 0.0, model.theta(), None)
+        row, _ = motion.system.law.given(np.array([value]), np.array([True]), motion.law_parameters(0.0, None), None)
         logs.append(motion.values(motion.law, X[:, :5].copy(), 0.0, row)[0])
     assert np.allclose(np.exp(logs).sum(axis=0) * 2 * np.pi / 400, 1.0, atol=1e-6)
 

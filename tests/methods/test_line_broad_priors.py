@@ -81,3 +81,16 @@ def test_a_drift_that_grows_exponentially_is_followed():
     expected = reference(lambda x: -np.clip(np.sinh(x), -1e8, 1e8), 0.0, 100.0, 4000, 120)
     assert not result.warnings
     assert holds(result, expected, 4e-4)
+
+
+@pytest.mark.parametrize("smooth", [False, True])
+def test_a_density_that_no_grid_holds_is_lost_and_stays_lost(smooth):
+    """The logarithm of a state grows as exp(2 t): modes near zero stay narrow while tails pass every bound."""
+    model = zakai.Model(
+        state=["x"], drift=["x*log(x**2 + 1)"], observation=["x"], observation_kind="samples", observation_noise=[["0.2"]],
+        prior={"kind": "gaussian", "mean": [0.5], "cov": [[0.5]]},
+    )  # fmt: skip
+    record = zakai.Record([1.0, 2.0, 3.0], [[1.9], [0.2], [-1.1]], "samples")
+    result = (zakai.smooth if smooth else zakai.filter)(model, record)
+    assert any("the density was lost at t = 1" in warning for warning in result.warnings)
+    assert smooth or np.isnan(result.mean[1:]).all()

@@ -86,8 +86,8 @@ def _split(model: Model) -> str:
         return f"; {', '.join(found)} linear given {', '.join(found.given)}, and drawn with moves of the past: {split.reason}"
     linear = [model.state[i] for i in split.linear]
     given = ", ".join(name for name in model.state if name not in linear)
-    unless = ", if the path of these does not give them away within an interval" if split.coupled else ""
-    return f"; each particle carries the mean and the covariance of {', '.join(linear)} given {given}{unless}"
+    unless = ", if the path of these does not give them away within an interval, and" if split.coupled else ", if"
+    return f"; each particle carries the mean and the covariance of {', '.join(linear)} given {given}{unless} that saves time"
 
 
 def _record(given: RecordFile, model: Model) -> Record:

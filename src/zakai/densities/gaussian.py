@@ -146,10 +146,29 @@ class GaussianMixture(DensityMethods):
             tuple(self.periodic[i] for i in keep),
         )
 
+    def drawn(self, share: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return weights (N,) and points (N, n), sums over which are expectations, by uniform numbers (n + 1, N).
+
+        The first row draws the components, with the signs of their weights, and the others a point of each.
+        """
+        from scipy.special import ndtri
+
+        order = np.argsort(self.means[:, 0], kind="stable")  # neighbours in the order are neighbours in the state
+        size = np.cumsum(np.abs(self.weights[order]))
+        which = order[np.searchsorted(size, share[0] * size[-1]).clip(0, len(order) - 1)]
+        x = self.means[which] + np.einsum("cij,cj->ci", self._roots[which], ndtri(share[1:]).T)
+        signs = np.sign(self.weights[which])
+        return signs / signs.sum(), np.where(self.periodic, wrap(x), x)
+
+    @property
+    def _roots(self) -> np.ndarray:
+        """Roots R (k, n, n) with R R' = P, which may be singular."""
+        variances, axes = np.linalg.eigh(self.covs)
+        return np.asarray(axes * np.sqrt(np.maximum(variances, 0.0))[:, None])
+
     def sample(self, key: object, count: int) -> np.ndarray:
         rng, count = generator(key), sample_size(count)
-        variances, axes = np.linalg.eigh(self.covs)  # which may be singular
-        roots = axes * np.sqrt(np.maximum(variances, 0.0))[:, None]
+        roots = self._roots
         size, signed = np.abs(self.weights), bool((self.weights < 0.0).any())
         positive = GaussianMixture(size / size.sum(), self.means, self.covs, self.names, self.periodic)
         x, rest = np.empty((count, len(self.names))), np.arange(count)

@@ -42,6 +42,8 @@ class Train(Protocol):
 
     def cloud(self, count: int) -> tuple[np.ndarray, np.ndarray]: ...
 
+    def quadrature(self, count: int) -> tuple[np.ndarray, np.ndarray]: ...
+
 
 @dataclass(frozen=True, repr=False)
 class TensorTrainDensity(DensityMethods):
@@ -106,6 +108,11 @@ class TensorTrainDensity(DensityMethods):
         """Return a mixture of Gaussian kernels around so many points, with the same mean and covariance."""
         points, weights = self.train.cloud(count)
         return PointMasses(weights, points.T, self.names, self.periodic).smoothed
+
+    def quadrature(self, count: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return fixed weights (N,) and points (N, n), sums over which are expectations; N is about `count`."""
+        points, weights = self.train.quadrature(2 * (count // 2))
+        return weights, points.T
 
     def quantile(self, q: Sequence[float]) -> np.ndarray:
         wanted = probabilities(q)

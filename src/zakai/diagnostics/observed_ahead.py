@@ -1,8 +1,8 @@
 """Predictions of observations: their laws before they are made, one row ahead in a record or at later times.
 
 The law of a coordinate z of a row is a mixture: p(z) = sum_i w_i p(z | x_i, t) over the predicted density of the state, which is
-a grid or a sum of Gaussians; of another density 20,000 draws with a fixed seed are taken.  Of an increment the state is that in
-the middle of its interval.
+a grid or a sum of Gaussians; of another density draws are taken, always the same.  Of an increment the state is that in the
+middle of its interval.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from zakai import _display
 from zakai._progress import Progress, counting
-from zakai.diagnostics.predictive import Mixture, PredictiveSums
+from zakai.diagnostics.predictive import DRAWS, Mixture, PredictiveSums
 from zakai.engine.forecast import future_of, origin_of
 from zakai.engine.loop import CHUNK, Run, segments
 from zakai.engine.setting import Setting
@@ -28,7 +28,6 @@ if TYPE_CHECKING:
     from zakai.engine.results import FilterResult
 
 Array = NDArray[Any]
-DRAWS = 20_000  # of a density that is no mixture
 SMALL = 1e-10  # weight of a point, relative to the largest, that is left out
 HALVINGS = 60  # of the bracket of a quantile
 EXTENT = 39.0  # standard deviations beyond which a Gaussian has no probability in double precision
@@ -265,8 +264,9 @@ def _law(run: Run, sums: PredictiveSums, k: int, state: Any, shift: Array) -> La
     density = setting.method.density(prepared, predicted)
     mixture = Mixture.of(density)
     if mixture is None or (mixture.covs is not None and not (sums.gaussian and sums.affine)):
-        points = density.sample(np.random.default_rng(0), DRAWS)
-        mixture = Mixture(np.full(DRAWS, 1.0 / DRAWS), points, None, ())
+        mixture = Mixture.drawn(density)
+    if mixture is None:
+        mixture = Mixture(np.full(DRAWS, 1.0 / DRAWS), density.sample(np.random.default_rng(0), DRAWS), None, ())
     kept = mixture.weights > SMALL * mixture.weights.max()  # without negative ones, from which nothing can be drawn
     mixture = Mixture(mixture.weights[kept], mixture.points[kept], None if mixture.covs is None else mixture.covs[kept], ())
     weights, points = mixture.weights / mixture.weights.sum(), mixture.points

@@ -1,7 +1,4 @@
-"""The law of the observations of a row by quadrature over the evidence of the filter's own step, for every method.
-
-Samples are predicted once: the steps of the quadrature begin at the time of the row.
-"""
+"""The law of the observations of a row by quadrature over the evidence of the filter's own step, for every method."""
 
 from __future__ import annotations
 
@@ -35,19 +32,12 @@ class PredictiveEvidence:
         law = self.model.observation_law
         self.families = law.families if self.samples else ("gaussian",) * self.model.m
         self.angles = [angle or family == "von-mises" for angle, family in zip(law.angles, self.families, strict=True)]
-        self.prefixes = _prefixes(schedule, schedule.stops if self.samples else schedule.starts)
-        self.prepared: dict[int, Any] = {}
+        self.schedule = schedule
         self.mass_error = 0.0
-
-    def prefix(self, count: int) -> tuple[Schedule, Any]:
-        """Return the schedule in which only the first coordinates of a row are observed, and what is prepared for it."""
-        if count not in self.prepared:
-            self.prepared[count] = self.setting.prepared(self.prefixes[count])
-        return self.prefixes[count], self.prepared[count]
 
     def row(self, k: int, state: Any, values: Array) -> Pair:
         """Return P(Z_j < z_j) and P(Z_j <= z_j) (m,) of the observations at the end of interval k, from the state before it."""
-        seen = np.flatnonzero(self.prefixes[-1].seen[k])
+        seen = np.flatnonzero(self.schedule.seen[k])
         below, upto = np.full((2, len(values)), np.nan)
         if self.samples:
             state = self.sums.predicted(k, state)[1]
@@ -62,13 +52,13 @@ class PredictiveEvidence:
                 value = self._evidence(i + 1, k, state, row, np.append(known, j))[0] - log_mass
                 return value if isfinite(value) else -inf
 
-            location = self._location(self.prefixes[i + 1], k, moments, j)
+            location = self._location(self.sums.prefix(i + 1)[0], k, moments, j)
             below[j], upto[j] = self._probabilities(log_density, float(values[j]), j, location)
         return below, upto
 
     def _evidence(self, count: int, k: int, state: Any, values: Array, known: Array) -> tuple[float, Pair]:
         """Return the log density of some coordinates of a row given the past, and the moments of the state given both."""
-        _, info = self.setting.method.step(self.prefix(count)[1], k, state, values)
+        _, info = self.setting.method.step(self.sums.prefix(count)[1], k, state, values)
         value = float(np.real(info.log_likelihood_increment))
         if not self.samples and len(known):  # the step gives the density relative to that of the noise
             cov = self.sums.noise_of_increments(k)[np.ix_(known, known)]
@@ -119,13 +109,3 @@ class PredictiveEvidence:
         self.mass_error = max(self.mass_error, abs(log_mass) if isfinite(log_mass) else inf)
         return found[0], found[-1]
 
-
-def _prefixes(schedule: Schedule, starts: Array) -> list[Schedule]:
-    """Return the schedules from `starts` in which only the first 0, 1, ..., m observed coordinates of each row are observed."""
-    order = np.cumsum(schedule.seen, axis=1)
-    found = []
-    for count in range(schedule.seen.shape[1] + 1):
-        seen = schedule.seen & (order <= count)
-        elapsed = np.where(seen, schedule.elapsed, 0.0)
-        found.append(Schedule(starts, schedule.stops, seen, elapsed, schedule.inputs))
-    return found

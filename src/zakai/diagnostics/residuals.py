@@ -1,9 +1,10 @@
 """Residuals: where each observation lies in its one-step-ahead predictive law.
 
-The law is a sum over the predicted density where that is a grid or a mixture of Gaussians (`zakai.diagnostics.predictive`).
-Elsewhere the density of a coordinate z given the past is the evidence of the filter's own step as a function of z; for an
-increment, times the density of the noise alone.  Its distribution function is a quadrature over z, so that every method and every
-kind of observation is served, with the accuracy of the method.
+The law is a sum over the predicted density where that is a grid, points, a mixture of Gaussians, or a tensor train
+(`zakai.diagnostics.predictive`).  Elsewhere, and where such a sum is too coarse, the density of a coordinate z given the past is
+the evidence of the filter's own step as a function of z; for an increment, times the density of the noise alone.  Its
+distribution function is a quadrature over z, so that every method and every kind of observation is served, with the accuracy of
+the method.
 """
 
 from __future__ import annotations

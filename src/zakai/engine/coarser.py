@@ -18,19 +18,21 @@ from zakai.methods._protocol import Infos
 from zakai.numerics.sums.mixture import wrapped
 
 Array = NDArray[np.float64]
+Done = Callable[[float], None]
+Again = Callable[[Setting, Done], Infos]
 COARSE = 1e-2  # tolerance of the second run: the largest that is fine enough for three digits
 TIMES, COARSEST = 10.0, 0.1  # by which it is coarser than a tolerance that is as large; the largest that a method takes
 LOST = 1.0  # deviations between the runs from which the coarser one has lost the density, and says nothing of later rows
 
 
-def distances(setting: Setting, mean: Array, cov: Array, again: Callable[[Setting], Infos]) -> Array | None:
+def distances(setting: Setting, mean: Array, cov: Array, again: Again) -> Array | None:
     """Return the distance of the moments from those at a coarser tolerance, in deviations (K,).
 
     Args:
         setting: the method of the run.
         mean: (K, n), after each interval.
         cov: (K, n, n).
-        again: returns what another setting reports after each interval.
+        again: returns what another setting reports after each interval, and calls a function of the number of them after each.
 
     Returns:
         The largest relative difference of a mean or a deviation; infinite after the coarser run has lost the density. None where
@@ -47,8 +49,10 @@ def distances(setting: Setting, mean: Array, cov: Array, again: Callable[[Settin
     if tolerance <= own:
         return None
     try:
-        with announced(f"{setting.method.name}: comparing with a result of tolerance={tolerance:g}, to estimate the error,"):
-            infos = again(setting._replace(options={**setting.options, "tolerance": tolerance}))
+        what = f"{setting.method.name}: comparing with a result of tolerance={tolerance:g}, to estimate the error,"
+        with announced(what) as advance:
+            coarser = setting._replace(options={**setting.options, "tolerance": tolerance})
+            infos = again(coarser, lambda done: advance(done, len(mean), len(mean)))
     except ZakaiError:
         return None
     angles = tuple(i for i, name in enumerate(setting.model.state) if name in setting.model.periodic)

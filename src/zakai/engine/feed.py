@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from functools import lru_cache, partial
 from math import isfinite
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -13,7 +13,7 @@ from zakai.densities import Density
 from zakai.engine.along_path import along_path
 from zakai.engine.setting import Setting
 from zakai.errors import InputError
-from zakai.methods._protocol import Info, Prepared, stacked
+from zakai.methods._protocol import Info, Prepared, State, stacked
 from zakai.methods.system.escape import EscapeError
 from zakai.notes.lengths import distances_of_lengths, notes_on_lengths
 from zakai.notes.misfit import notes_on_law
@@ -39,7 +39,7 @@ class Moment(NamedTuple):
 
     time: float
     length: float
-    state: Any
+    state: State
     info: Info | None
     values: tuple[float, ...]
     times: tuple[float, ...]
@@ -59,7 +59,7 @@ class Feed:
         self._noise_varies = noise_varies(model)
         # What is prepared depends on the length alone where nothing depends on time: the last lengths are kept.
         self._kept = lru_cache(KEPT)(partial(self._prepared, 0.0)) if setting.autonomous else None
-        self._first: dict[tuple[Any, ...], Prepared] = {}  # what is prepared for the first interval of each kind
+        self._first: dict[tuple[object, ...], Prepared] = {}  # what is prepared for the first interval of each kind
         start = float(model.start)
         self.now = Moment(start, 0.0, state, None, (0.0,) * self.m, (start,) * self.m, self.empty.notes)
 

@@ -9,6 +9,7 @@ import numpy as np
 from zakai.engine.batch import filter_all
 from zakai.engine.loop import Run
 from zakai.errors import InputError
+from zakai.methods._protocol import State
 from zakai.methods._states import Joined
 from zakai.records import Inputs, Record
 from zakai.records.inputs import check_inputs, expected_inputs
@@ -18,7 +19,7 @@ if TYPE_CHECKING:
     from zakai.engine.results import FilterResult
 
 
-def origin_of(result: FilterResult, what: str) -> tuple[Plan, tuple[Any, ...], Record]:
+def origin_of(result: FilterResult, what: str) -> tuple[Plan, tuple[State, ...], Record]:
     """Return how a result was computed, the last states of its runs, and its record.
 
     Raises:
@@ -72,7 +73,7 @@ def forecast(result: FilterResult, times: Any, inputs: Inputs | None = None) -> 
 class ForecastRun(Run):
     """A run that continues another one from its last state."""
 
-    def __init__(self, run: Run, state: Any, last: float):
+    def __init__(self, run: Run, state: State, last: float):
         super().__init__(run.setting, run.record, None, run.most)
         self.state = self.first = state
         self.states = Joined([[state]])

@@ -19,7 +19,7 @@ from zakai.engine.driver import check_noise, check_records, planned, with_inputs
 from zakai.engine.loop import CHUNK, Run, segments
 from zakai.engine.setting import Setting
 from zakai.errors import ConditionError, InputError
-from zakai.methods._protocol import Infos
+from zakai.methods._protocol import Infos, State
 from zakai.models._entries import formula
 from zakai.models._errors import did_you_mean, listing
 from zakai.models.checks import COEFFICIENTS, depends_on_state, noise_check
@@ -267,7 +267,7 @@ class _Part(NamedTuple):
         method, prior = self.setting.method, self.setting.prior
         if method.tangents is None:
             return None
-        states: list[Any] = []
+        states: list[State] = []
         parts, slopes = [], np.zeros(len(shifted))
         for start in range(0, len(self.schedule), CHUNK):
             rows = slice(start, min(start + CHUNK, len(self.schedule)))

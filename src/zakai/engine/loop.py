@@ -4,16 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from zakai.densities import Density
 from zakai.engine.along_path import along_path, record_along
-from zakai.engine.coarser import distances
+from zakai.engine.coarser import Done, distances
 from zakai.engine.setting import KEPT, Setting
 from zakai.errors import InputError
-from zakai.methods._protocol import Infos, Prepared, stacked
+from zakai.methods._protocol import Infos, Prepared, State, joined, stacked
 from zakai.methods._states import Joined
 from zakai.methods.system.escape import EscapeError
 from zakai.notes.health import warnings_of_run
@@ -40,8 +40,8 @@ KEPT_BYTES = 512 * 2**20  # of densities that are kept by default
 
 @one_thread
 def advance(
-    setting: Setting, prepared: Prepared, rows: slice, state: Any, values: np.ndarray, stepped: Callable[[], None] | None = None
-) -> tuple[Sequence[Any], Infos]:
+    setting: Setting, prepared: Prepared, rows: slice, state: State, values: np.ndarray, stepped: Callable[[], None] | None = None
+) -> tuple[Sequence[State], Infos]:
     """Advance a state over the intervals `rows` of what is prepared; `values` (rows, m) are their observations.
 
     `stepped` is called after every single step.
@@ -72,15 +72,15 @@ class Segment(NamedTuple):
     first: int
     prepared: Prepared
     rows: slice
-    before: Any
-    states: Sequence[Any]
+    before: State
+    states: Sequence[State]
     infos: Infos
 
 
 def segments(
     setting: Setting,
     schedule: Schedule,
-    state: Any,
+    state: State | None,
     values: np.ndarray,
     size: int = PIECE,
     stepped: Callable[[], None] | None = None,
@@ -113,15 +113,7 @@ def segments(
             size = max(1, min(GROWTH * size, PIECE, AT_ONCE // max(size_of(state), 1)))
 
 
-def joined(parts: Sequence[Infos]) -> Infos:
-    """Return the reports of consecutive segments as one."""
-    health = {name: np.concatenate([part.health[name] for part in parts]) for name in parts[0].health}
-    increments, means, covs = (np.concatenate([part[i] for part in parts]) for i in range(3))
-    errors = [None if parts[0][i] is None else np.concatenate([part[i] for part in parts]) for i in (4, 5)]
-    return Infos(increments, means, covs, health, *errors)
-
-
-def size_of(state: Any) -> int:
+def size_of(state: object) -> int:
     """Return the bytes of the arrays of a state, or of several."""
     if isinstance(state, np.ndarray):
         return state.nbytes
@@ -140,7 +132,7 @@ class Run:
         self.keep, self.must_keep = keep != "moments", keep == "densities"
         self.empty, self.state = setting.begin()
         self.first = self.state
-        self.states: Joined[Any] = Joined([[self.state]])
+        self.states: Joined[State] = Joined([[self.state]])
         self.parts: list[Infos] = []
         self.notes: dict[str, None] = dict.fromkeys(
             [
@@ -171,7 +163,7 @@ class Run:
         for first in range(0, min(len(self.schedule), KEPT * CHUNK), CHUNK):
             self.setting.prepared(self.schedule.part(slice(first, min(first + CHUNK, len(self.schedule)))))
 
-    def _take(self, states: Sequence[Any], infos: Infos) -> None:
+    def _take(self, states: Sequence[State], infos: Infos) -> None:
         self.state = states[-1]
         self.parts.append(infos)
         self.done += len(states)
@@ -226,9 +218,20 @@ class Run:
 
         return warnings_of_run(result, self.setting.method.losses, apart)
 
-    def again(self, setting: Setting) -> Infos:
-        """Return what another setting of the method reports after each interval."""
-        return joined([one.infos for one in segments(setting, self.schedule, None, self.values)])
+    def again(self, setting: Setting, done: Done) -> Infos:
+        """Return what another setting of the method reports after each interval; `done` is called with the number of these."""
+        parts, count = list[Infos](), 0
+
+        def stepped() -> None:
+            nonlocal count
+            count += 1
+            done(count)
+
+        for one in segments(setting, self.schedule, None, self.values, 1, stepped):
+            parts.append(one.infos)
+            count = one.first + len(one.states)
+            done(count)
+        return joined(parts)
 
     def why_no_density(self) -> str:
         """Return why densities were not kept."""

@@ -19,7 +19,7 @@ import numpy as np
 from zakai._progress import bar
 from zakai.engine.loop import advance
 from zakai.errors import InputError
-from zakai.methods._protocol import Prepared
+from zakai.methods._protocol import Prepared, State
 from zakai.records.schedule import Schedule
 
 if TYPE_CHECKING:
@@ -101,7 +101,7 @@ class _Paths:
                 "are inaccurate there; give more frequent observations", self.inaccurate, len(run.schedule),
             )  # fmt: skip
 
-    def _before(self, prepared: Prepared, number: int, k: int, later: np.ndarray, state: Any) -> np.ndarray:
+    def _before(self, prepared: Prepared, number: int, k: int, later: np.ndarray, state: State) -> np.ndarray:
         """Return the draws at the start of interval k, which has this number in what is prepared."""
         draw = self.run.backward.draw
         assert draw is not None
@@ -120,7 +120,7 @@ class _Paths:
             self.parts //= 2
         return paths
 
-    def _in_parts(self, k: int, later: np.ndarray, state: Any) -> tuple[np.ndarray, float]:
+    def _in_parts(self, k: int, later: np.ndarray, state: State) -> tuple[np.ndarray, float]:
         """Return the draws at the start of interval k by equal parts of it, and the largest departure."""
         run, draw = self.run, self.run.backward.draw
         assert draw is not None

@@ -19,6 +19,7 @@ from zakai.engine.kept_record import Variables, quantiles_of, record_of
 from zakai.engine.table import save_table
 from zakai.engine.variables import attributes_of, variables_of
 from zakai.errors import InputError
+from zakai.methods._protocol import State
 from zakai.models.model import Model
 from zakai.records import Record
 from zakai.records.dates import Clock
@@ -68,7 +69,7 @@ class FilterResult:
     state: tuple[str, ...] = ()
     attributes: dict[str, str] = field(default_factory=dict)
     blocks: tuple[FilterResult, ...] = ()
-    origin: tuple[Plan, tuple[Any, ...]] | None = None
+    origin: tuple[Plan, tuple[State, ...]] | None = None
     mean_standard_error: np.ndarray | None = None
     log_likelihood_standard_error: float | None = None
     increment_law_error: np.ndarray | None = None

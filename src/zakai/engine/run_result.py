@@ -8,9 +8,10 @@ import numpy as np
 
 from zakai.algebra.conditions import Condition
 from zakai.engine.along_path import record_along
-from zakai.engine.loop import Run, joined
+from zakai.engine.loop import Run
 from zakai.engine.results import FilterResult
 from zakai.engine.versions import versions
+from zakai.methods._protocol import joined
 from zakai.notes.escape import notes_on_escape
 from zakai.notes.lengths import distances_of_lengths, notes_on_lengths
 from zakai.notes.misfit import notes_on_law

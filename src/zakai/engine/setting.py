@@ -9,7 +9,7 @@ import numpy as np
 
 from zakai.densities import Density
 from zakai.errors import InputError
-from zakai.methods._protocol import Method, Prepared
+from zakai.methods._protocol import Method, Prepared, State
 from zakai.models.domain import NEGLIGIBLE
 from zakai.models.kept import kept
 from zakai.models.model import Model
@@ -68,7 +68,7 @@ class Setting(NamedTuple):
         return result
 
     @one_thread
-    def begin(self) -> tuple[Prepared, Any]:
+    def begin(self) -> tuple[Prepared, State]:
         """Return what is prepared for no interval, and the state at the model's start."""
         prepared = self.prepared(Schedule.empty(self.model.m))
         inside = self.model.n > 1 and bool(self.model.domain) and isinstance(self.prior, DensityPrior)

@@ -19,14 +19,15 @@ from zakai.algebra.conditions import all_hold
 from zakai.algebra.theorems import conditions_of
 from zakai.densities import Density
 from zakai.engine.batch import filter_all, smooth_all
+from zakai.engine.coarser import Done
 from zakai.engine.driver import check_noise, check_records, with_inputs
-from zakai.engine.loop import CHUNK, KEPT_BYTES, Run, advance, joined, size_of
+from zakai.engine.loop import CHUNK, KEPT_BYTES, Run, advance, size_of
 from zakai.engine.paths import sample_paths
 from zakai.engine.plan import plan_of
 from zakai.engine.results import FilterResult
 from zakai.engine.setting import Setting
 from zakai.errors import InputError
-from zakai.methods._protocol import Info, Infos, Prepared, stacked
+from zakai.methods._protocol import Info, Infos, Prepared, State, joined, stacked
 from zakai.methods._states import Joined
 from zakai.models.model import Model
 from zakai.numerics.one_thread import one_thread
@@ -166,7 +167,7 @@ class _Opened(NamedTuple):
     rows: range
     prepared: Prepared
     begin: int
-    states: Sequence[Any]
+    states: Sequence[State]
     messages: list[Any]
 
 
@@ -180,20 +181,20 @@ class SmoothingRun(Run):
         super().__init__(setting._replace(options={**setting.options, **backward.options}), record, "moments")
         self.backward = backward
         backward.message(self.empty, self.state)  # a model without a smoother is refused before it is filtered
-        self.segments: list[tuple[int, Any]] = []  # the first interval of each, and the state at its start
-        self.after: list[Sequence[Any] | None] = []  # the states after each interval of a segment, while there is memory
+        self.segments: list[tuple[int, State]] = []  # the first interval of each, and the state at its start
+        self.after: list[Sequence[State] | None] = []  # the states after each interval of a segment, while there is memory
         self.messages: list[Any] = []  # at the end of each segment
         self.held = 0
         self.opened: dict[int, _Opened] = {}  # the segments of which densities were asked, while there is memory
         self.start: Info | None = None  # what is smoothed at the start
 
-    def _take(self, states: Sequence[Any], infos: Infos) -> None:
+    def _take(self, states: Sequence[State], infos: Infos) -> None:
         self.segments.append((self.done, _alone(self.state)))
         self.held += size_of(states)
         self.after.append(states if self.held < KEPT_BYTES / 4 else None)
         super()._take(states, infos)
 
-    def _segment(self, number: int) -> tuple[range, Prepared, int, Sequence[Any]]:
+    def _segment(self, number: int) -> tuple[range, Prepared, int, Sequence[State]]:
         """Return the intervals of a segment, what is prepared for them and from which interval on, and the states around them."""
         first, state = self.segments[number]
         last = self.segments[number + 1][0] if number + 1 < len(self.segments) else len(self.schedule)
@@ -242,7 +243,7 @@ class SmoothingRun(Run):
         self,
         prepared: Prepared,
         rows: slice,
-        states: Sequence[Any],
+        states: Sequence[State],
         message: Any,
         observed: range,
         stepped: Callable[[], None] | None = None,
@@ -285,13 +286,19 @@ class SmoothingRun(Run):
         """Return what the figures of the filter say, nothing while they stand beside those of the smoother."""
         return [] if self.start is not None else super().health_warnings(result)
 
-    def again(self, setting: Setting) -> Infos:
+    def again(self, setting: Setting, done: Done) -> Infos:
         """Return what another setting of the method reports after each interval, of the smoother once the record is smoothed."""
         if self.start is None:
-            return super().again(setting)
-        other = SmoothingRun(setting, self.record)
-        other.all()
-        other.smooth(lambda run, count: None, lambda run: None)
+            return super().again(setting, done)
+        other, count = SmoothingRun(setting, self.record), 0
+
+        def reported(run: Run, more: int) -> None:
+            nonlocal count
+            count += more
+            done(0.5 * count)  # the pass through the record is half of the work, and the way back the other half
+
+        other.all(reported)
+        other.smooth(reported, lambda run: None)
         return joined(other.parts)
 
     def complete(self, result: FilterResult) -> FilterResult:

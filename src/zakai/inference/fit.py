@@ -17,11 +17,12 @@ from zakai.engine.likelihood import LogLikelihood, chosen_parameters
 from zakai.errors import InputError
 from zakai.inference.maximum import maximum, with_signs_of
 from zakai.inference.profile import Profile, Quadratic
-from zakai.inference.random_maximum import random_maximum, sentence
+from zakai.inference.random_maximum import random_maximum, sentence, usual_values
 from zakai.models._errors import listing
 from zakai.models.model import Model
 from zakai.records import Inputs, Record
 
+USUAL = 5, 10  # evaluations for each parameter, and as many more, that a search with gradients usually takes
 SMALL = 0.1  # of a standard error, by which the jumps of a log-likelihood may move its maximum without a warning
 
 
@@ -182,7 +183,7 @@ def fit(
         return _fit_by_values(now, record, (names, values, box), method, given, maker)
     function, known = LogLikelihood(now, record, method, names, options), dict[bytes, tuple[float, np.ndarray]]()
     what = f"{model.source}: fit: the search for the largest log-likelihood by {listing(names)}"
-    with bar("fitting: log-likelihood and gradient") as advance, announced(what):
+    with bar("fitting: log-likelihood and gradient") as advance, announced(what) as announce:
 
         def counted(theta: np.ndarray) -> tuple[float, np.ndarray]:
             key = theta.tobytes()
@@ -190,6 +191,7 @@ def fit(
                 if advance is not None:
                     advance(len(known) + 1, None)
                 known[key] = function.unwarned(theta)
+                announce(len(known), *(count * (1 + len(names)) for count in USUAL))
             return known[key]
 
         found = with_signs_of(values, maximum(counted, values, box, names, model, function.exists), counted, box)
@@ -251,7 +253,7 @@ def _fit_by_values(
         return run_filter(at, record, method, keep="moments", **own)
 
     what = f"{model.source}: fit: the search for the largest log-likelihood by {listing(names)}"
-    with bar("fitting: log-likelihood") as advance, announced(what):
+    with bar("fitting: log-likelihood") as advance, announced(what) as announce:
 
         def value(theta: np.ndarray, seed: int) -> float:
             key = theta.tobytes(), seed
@@ -264,6 +266,7 @@ def _fit_by_values(
                     known[key] = result_at(theta, seed, choices.get(seed)).log_likelihood
                 except InputError:
                     known[key] = -np.inf
+                announce(len(known), *usual_values(len(names), first is not None))
             return known[key]
 
         found = random_maximum(value, values, box, first is not None)

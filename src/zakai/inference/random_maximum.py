@@ -19,12 +19,19 @@ import numpy as np
 
 Array = Any
 ROUNDS, SEEDS = 12, 4
+USUAL = 2, 6  # rounds of a search
 FIRST = 0.1  # distance of the first points, relative to a parameter
 CLOSE = 0.2  # of a step, in distances of the points, that ends the search
 DISTANCE = 1.5  # of the points, in standard errors
 NEAR = 0.5  # the same for jumps of some thousandths: further away a likelihood is no quadratic
 SHIFT = 0.1  # between centres, in distances of the points: the jumps of tensor trains are independent from 1e-3 on
 _FACTOR = 3.0  # by which the distances change in a round, at most
+
+
+def usual_values(p: int, seeds: bool) -> tuple[int, int]:
+    """Return the fewest and the most values that a search in p parameters usually takes, those at its end among them."""
+    each = 1 + p + p * p  # of a quadratic
+    return (USUAL[0] * (1 + seeds) + SEEDS) * each, (USUAL[1] * (1 + seeds) + SEEDS) * each
 
 
 class RandomMaximum(NamedTuple):

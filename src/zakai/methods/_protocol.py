@@ -61,6 +61,8 @@ class Infos(NamedTuple):
     log_likelihood_standard_error: np.ndarray | None = None
 
 
+State = tuple[Any, ...]  # of a method that is not known: a NamedTuple of arrays, numbers, booleans, strings and tuples of these
+
 S = TypeVar("S")
 
 
@@ -75,6 +77,14 @@ def stacked(infos: Sequence[Info]) -> Infos:
         np.array([info.mean_standard_error for info in infos]) if random else None,
         np.array([info.log_likelihood_standard_error for info in infos]) if random else None,
     )
+
+
+def joined(parts: Sequence[Infos]) -> Infos:
+    """Return the reports of consecutive steps as one."""
+    health = {name: np.concatenate([part.health[name] for part in parts]) for name in parts[0].health}
+    increments, means, covs = (np.concatenate([part[i] for part in parts]) for i in range(3))
+    errors = [None if parts[0][i] is None else np.concatenate([part[i] for part in parts]) for i in (4, 5)]
+    return Infos(increments, means, covs, health, *errors)
 
 
 class Tangents(NamedTuple, Generic[S]):

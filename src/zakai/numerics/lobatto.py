@@ -9,12 +9,11 @@ up to the ends, and to kinks and jumps of the coefficients where two intervals m
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[Any]
+from zakai.numerics.arrays import Array
 
 
 class Rule(NamedTuple):

@@ -12,6 +12,7 @@ import numpy as np
 
 from zakai.methods._protocol import Info
 from zakai.methods.frame.chain import Chain, Prediction, corrections, extrapolated
+from zakai.methods.frame.errors import Error
 from zakai.methods.frame.placement import Mass
 from zakai.methods.frame.state import Choice, Control, Half, Made, Prepared, State, Substeps
 from zakai.methods.frame.unresolved import Unresolved
@@ -26,7 +27,7 @@ def begun(prepared: Prepared, function: Callable[[Array], Array], choice: Choice
     """Return the prior by a known build."""
     v = _built(prepared, function, choice)
     n = prepared.model.n
-    return State.of(v.scaled(1.0 / v.mass), Control(0, Substeps(1.0, 0.0), np.zeros((n, n)), np.zeros(n)))
+    return State.of(v.scaled(1.0 / v.mass), Control(0, Substeps(1.0, 0.0), Error.zero(n)))
 
 
 def step(chain: Chain, state: State, made: Made, figures: Sequence[str]) -> tuple[State, Info]:

@@ -106,7 +106,7 @@ def step(prepared: Prepared, k: int, later: Message, values: Array, state: State
     rng, x, moments, unknown = _generator(control.interval, later.seed), later.draws, later.moments, 0.0
     try:
         law = prepared.motion.likelihood(chain.interval, values)
-        prediction, _, _, in_time, *_ = predicted(chain, state, law)
+        prediction, _, _, in_time, _ = predicted(chain, state, law)
     except (Unresolved, np.linalg.LinAlgError):
         return later._replace(draws=np.full_like(x, np.nan), moments=None, error=math.nan, unknown=0.0, last=False)
     for move in reversed(chain.moves):

@@ -157,9 +157,8 @@ class Builder:
         points = control.points, control.moving
         built = cross(placed.grid, function, points, options, self.prepared.system.periods, expected)
         self._edges = built.train.edges()
-        relative = relative_difference(built.train.evaluate, function, control)
-        self.missed = Missed(control, relative)
-        error = float(control.moving @ np.abs(relative))
+        self.missed = Missed(control, relative_difference(built.train.evaluate, function, control))
+        error = self.missed.size
         rank = max(built.train.ranks)
         report = Report(
             built.evaluations, built.sweeps, rank, built.error, error, float(self._edges.max(initial=0.0)), built.capped
@@ -168,17 +167,12 @@ class Builder:
 
 
 def relative_difference(one: Callable[[Array], Array], other: Callable[[Array], Array], control: Mass) -> Array:
-    """Return the difference of two densities relative to the second (P,), at points of it."""
-    values = other(control.points)
-    top = float(np.abs(values).max())
-    if not top > 0:
-        return np.full(len(values), np.inf)
-    return np.asarray((one(control.points) - values) / np.maximum(values, FLOOR * top))
+    """Return the difference of two densities relative to the second (P,), at points of it.
 
-
-def difference(one: Callable[[Array], Array], other: Callable[[Array], Array], control: Mass) -> float:
-    """Return the difference of two densities relative to the second, by weighted points of it.
-
-    It is that in L1, where a point far from the mean counts by its distance in deviations: so much it moves the mean.
+    Where the second is not positive, although points of it are there, it is known by its errors alone: the first one counts.
     """
-    return float(control.moving @ np.abs(relative_difference(one, other, control)))
+    found, values = one(control.points), other(control.points)
+    floor = FLOOR * float(np.abs(values).max())
+    if not floor > 0:
+        return np.full(len(values), np.inf)
+    return np.asarray((found - values) / np.where(values > floor, values, np.maximum(found, floor)))

@@ -19,7 +19,7 @@ from zakai.methods._protocol import Info
 from zakai.methods.frame import again
 from zakai.methods.frame.build import Builder
 from zakai.methods.frame.chain import MOST_SUBSTEPS, Chain, Prediction, extrapolated
-from zakai.methods.frame.errors import carried, in_deviations, ratio, total
+from zakai.methods.frame.errors import Error, in_deviations, root_of
 from zakai.methods.frame.moves import Shift
 from zakai.methods.frame.placement import Mass
 from zakai.methods.frame.state import Choice, Control, Made, Prepared, State, Substeps
@@ -38,10 +38,9 @@ PRIOR_POINTS, BLOCK = 1024, 1024
 TIME_SHARE, GAIN, SAFETY = 1.0, 4.0, 0.7
 IN_TAILS = 0.03  # error of a mean over tolerance e^depth: linear tracks with observations 4 and 6 deviations away
 BEYOND = 0.3  # error of a mean over the distance of an observation, where a Gaussian stands for the tails
-OF_MEAN = 0.6  # error of a mean over what a motion loses of the mass, what is near an edge, and the error of time in L1
-OF_GRID = 0.1  # error of a mean that control points do not show, over that off the grid in L1: tracks by radar and by bearings
-OF_TAILS = 0.25  # growth of the logarithm of a relative error with the depth, on wide tracks seen by bearings
+OF_MEAN = 0.6  # error of a mean over what a motion loses of the mass and what is near an edge
 DEEP, SHARPEST = 2.0, 0.03  # depth in nats from which a prediction has a smaller tolerance, and the least factor of it
+UNKNOWN = 1e3  # deviations of an error of which nothing is known
 WITHIN = 3.0  # tolerances that the error of a mean may reach
 FIGURES = (
     "error_estimate", "tolerance_ratio", "rank", "mass_defect", "off_grid_error", "edge_mass", "tail_depth", "powers",
@@ -69,8 +68,8 @@ def init(prepared: Prepared, prior: Any) -> State:
         choices.made[key] = made
     assert model.n == len(mass.points) and len(theta) == len(prepared.theta)
     _, P = mass.unwrapped(system.base.angles).moments()
-    error = builder.missed.of_mean(np.zeros(len(builder.missed.relative)), P, system.base.angles)
-    control = Control(0, Substeps(1.0, 0.0), error.square, np.zeros(model.n))
+    error = builder.missed.after(np.zeros(len(builder.missed.relative)), P, system.base.angles)
+    control = Control(0, Substeps(1.0, 0.0), error)
     return State.of(v.scaled(1.0 / v.mass), control)
 
 
@@ -194,7 +193,7 @@ def _step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[tupl
     builder = builder_of(prepared, state)
     chain = Chain(prepared, interval, values, builder)
     likelihood = prepared.motion.likelihood(interval, values)
-    prediction, count, time, in_time, shift, seen = predicted(chain, state, likelihood)
+    prediction, count, time, in_time, of_time = predicted(chain, state, likelihood)
     updated = update(builder, prediction, likelihood)
     v, rule = updated.density, builder.rule
     if choices is not None and updated.choice is not None and not any(isinstance(move, Shift) for move in chain.moves):
@@ -206,20 +205,19 @@ def _step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[tupl
     off_grid, edge = sum(report.off_grid for report in reports), max(report.edge for report in reports)
     # Far out a density is known relative to its largest value only; beyond, a Gaussian stands for it.
     far = min(IN_TAILS * rule.tolerance * math.exp(min(depth, 50.0)), BEYOND * math.sqrt(2.0 * max(depth, 0.0)))
-    new = math.hypot(OF_MEAN * (prediction.defect + edge + in_time), OF_GRID * off_grid, far)
+    new = math.hypot(OF_MEAN * (prediction.defect + edge), far)
     angles = prepared.system.base.angles
-    parts = [
-        (factor, missed.of_mean(prepared.motion.logs(likelihood, missed.mass.points), cov, angles))
-        for factor, missed in prediction.missed
-    ]
-    parts.append((1.0, builder.missed.of_mean(np.zeros(len(builder.missed.relative)), cov, angles)))
-    # Where an observation leads into the tails, the relative errors of earlier builds are larger.
-    larger = math.exp(2.0 * OF_TAILS * min(max(depth, 0.0), 50.0))
-    left = carried(prediction.mass.unwrapped(angles), prediction.slope, cov)
-    errors = larger * (left @ control.error @ left.T) + new**2 * cov + total(parts, len(mean)).square
-    # Errors of time have the same sign in many intervals.
-    bias = math.sqrt(larger) * left @ control.bias + ratio(cov, seen) @ shift
-    error = in_deviations(errors + np.outer(bias, bias), cov)
+    own = builder.missed.after(np.zeros(len(builder.missed.relative)), cov, angles).plus(of_time)
+    for factor, missed in prediction.missed:
+        own = own.plus(missed.after(prepared.motion.logs(likelihood, missed.mass.points), cov, angles), factor)
+    m, P = prediction.mass.unwrapped(angles).moments()
+    root, before, after = root_of(P), root_of(state.train(prepared.system.periods).moments()[1]), root_of(cov)
+    shift = mean - m
+    shift[angles] = wrap(shift[angles])
+    errors = control.error.along(np.linalg.solve(root, prediction.slope @ before))
+    errors = errors.seen(np.linalg.solve(root, after), np.linalg.solve(root, shift)).plus(own)
+    errors = errors.plus(Error.by_chance(len(mean), new))
+    error = in_deviations(errors.of_mean(after), cov)
     health = {
         "error_estimate": error,
         "tolerance_ratio": error / (WITHIN * prepared.tolerance),
@@ -234,14 +232,14 @@ def _step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[tupl
         "effective_share": updated.effective,
     }
     lost = max(chain.lost, prediction.defect)
-    after = Control(control.interval + 1, time, errors, bias, builder.after())
-    return (State.of(v, after), Info(updated.log_evidence, mean, cov, health)), lost
+    control = Control(control.interval + 1, time, errors, builder.after())
+    return (State.of(v, control), Info(updated.log_evidence, mean, cov, health)), lost
 
 
 def error_of(prepared: Prepared, state: State) -> float:
     """Return the estimated error of the mean of a state, in standard deviations."""
-    control = state.control
-    return in_deviations(control.error + np.outer(control.bias, control.bias), state.train(prepared.system.periods).moments()[1])
+    P = state.train(prepared.system.periods).moments()[1]
+    return in_deviations(state.control.error.of_mean(root_of(P)), P)
 
 
 def builder_of(prepared: Prepared, state: State) -> Builder:
@@ -250,17 +248,13 @@ def builder_of(prepared: Prepared, state: State) -> Builder:
 
 
 class Predicted(NamedTuple):
-    """A prediction, the number of its substeps, how the next are divided, the error of time, and that of the mean (n,).
-
-    The last is that of a density with a covariance (n, n).
-    """
+    """A prediction, the number of its substeps, how the next are divided, and the error of substeps after the observation."""
 
     prediction: Prediction
     substeps: int
     time: Substeps
-    error: float
-    shift: Array
-    cov: Array
+    in_time: float
+    error: Error
 
 
 def predicted(chain: Chain, state: State, likelihood: Likelihood) -> Predicted:
@@ -280,10 +274,10 @@ def _predicted(chain: Chain, state: State, likelihood: Likelihood) -> Predicted:
     """Return the prediction over an interval, whose substeps meet the tolerance where a likelihood leads."""
     base, interval, time = chain.prepared.system.base, chain.interval, state.control.time
     u, length = state.train(chain.prepared.system.periods), interval.stop - interval.start
-    nothing = np.zeros(u.grid.n), np.eye(u.grid.n)
+    nothing = Error.zero(u.grid.n)
     if length <= 0 or (base.affine and base.sampled and not base.driven):
         prediction, count = chain.first(u, 1)
-        return Predicted(prediction, count, time, 0.0, *nothing)
+        return Predicted(prediction, count, time, 0.0, nothing)
     allowed = SAFETY * TIME_SHARE * chain.builder.allowed
     guess = length * time.substeps / time.length if time.length > 0 else 1.0
     count = min(max(1, math.ceil(guess - 1e-9)), MOST_SUBSTEPS)
@@ -306,9 +300,9 @@ def _predicted(chain: Chain, state: State, likelihood: Likelihood) -> Predicted:
     if extrapolate:
         prediction, gain = _extrapolated(chain, u, prediction, count), 0.75 / GAIN
     if found is None:
-        return Predicted(prediction, count, time, math.inf, *nothing)
+        return Predicted(prediction, count, time, math.inf, Error.by_chance(u.grid.n, UNKNOWN))
     gain *= (found.substeps / count) ** 2
-    return Predicted(prediction, count, time, gain * error, gain * found.shift, found.cov)
+    return Predicted(prediction, count, time, gain * error, found.error.scaled(gain))
 
 
 def _extrapolated(chain: Chain, u: Train, coarser: Prediction, count: int) -> Prediction:

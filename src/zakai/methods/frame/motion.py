@@ -215,7 +215,7 @@ class Motion:
         base, t = self.system.base, interval.stop
         u = None if interval.inputs is None else interval.inputs.at(t, base.model.input_hold)
         if base.law is not None:
-            given, counted = base.law.given(values, interval.seen, t, self.theta, u)
+            given, counted = base.law.given(values, interval.seen, self.coefficients.law_parameters(t, u), u)
             return Likelihood(self.coefficients.law, given, counted, t, 1.0, 0.0)
         m, late = base.m, np.flatnonzero(interval.seen & ~interval.inside)
         P = np.zeros((m, m))

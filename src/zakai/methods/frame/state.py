@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from zakai.methods.frame.errors import Error
 from zakai.methods.frame.motion import Motion, System
 from zakai.methods.particles.interval import Interval
 from zakai.methods.particles.programs import Array
@@ -28,14 +29,12 @@ class Substeps(NamedTuple):
 class Control(NamedTuple):
     """What decides the next step beside the density.
 
-    The number of intervals, the substeps, the estimated error of the mean, as a covariance (n, n), that of the time steps, with
-    its sign (n,), and the factor of the tolerance where ranks met their limit.
+    The number of intervals, the substeps, the estimated error, and the factor of the tolerance where ranks met their limit.
     """
 
     interval: int
     time: Substeps
-    error: Array
-    bias: Array
+    error: Error
     looser: float = 1.0
 
 

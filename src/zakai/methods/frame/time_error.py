@@ -17,6 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from zakai.methods.frame.chain import Chain
+from zakai.methods.frame.errors import Error, root_of
 from zakai.methods.frame.placement import Mass
 from zakai.methods.particles.interval import Pilots, coupled
 from zakai.methods.particles.programs import Array
@@ -30,12 +31,11 @@ LEAST = 0.25  # share of the square of an error that is left when that of the po
 
 
 class TimeError(NamedTuple):
-    """The error of a number of substeps: its size, and that of the mean (n,) where the density has a covariance (n, n)."""
+    """The error of a number of substeps after the observation, and its size."""
 
     substeps: int
     size: float
-    shift: Array
-    cov: Array
+    error: Error
 
 
 def measured(chain: Chain, u: Train, count: int, likelihood: Likelihood) -> TimeError | None:
@@ -61,8 +61,7 @@ def measured(chain: Chain, u: Train, count: int, likelihood: Likelihood) -> Time
     other = mass.reweighted(power * finer).unwrapped(angles)
     one = Mass(x + other.points - y, mass.weights).reweighted(power * gained)
     mean, P = other.moments()
-    scale = np.maximum(np.sqrt(np.diag(P)), 1e-300)
-    root = scale[:, None] * np.linalg.cholesky(P / np.outer(scale, scale) + 1e-9 * np.eye(len(P)))
+    n, root = len(mean), root_of(P)
     moved, terms = (_monomials(np.linalg.solve(root, part.points - mean[:, None])) for part in (one, other))
     average = (terms @ other.weights)[:, None]
     each = one.weights * (moved - average) - other.weights * (terms - average)
@@ -72,7 +71,10 @@ def measured(chain: Chain, u: Train, count: int, likelihood: Likelihood) -> Time
     square = np.maximum(change**2 - random, LEAST * change**2)
     if not np.isfinite(square).all():
         return None
-    return TimeError(count, math.sqrt(float(square.max())), root @ change[: len(x)], P)
+    second, pairs = np.zeros((n, n)), np.triu_indices(n)
+    second[pairs] = math.sqrt(2.0) * change[n:]
+    second = second + np.triu(second, 1).T
+    return TimeError(count, math.sqrt(float(square.max())), Error.zero(n)._replace(first=change[:n], second=second))
 
 
 def _monomials(z: Array) -> Array:

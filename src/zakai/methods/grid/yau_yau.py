@@ -24,6 +24,7 @@ from zakai.methods.reflecting import filter as reflecting_filter
 from zakai.methods.reflecting.backward import BACKWARD as REFLECTING
 from zakai.models import features
 from zakai.models.model import Model
+from zakai.numerics.line.resolution import LOST_ALIASING
 from zakai.records.schedule import Schedule
 
 BOUNDS = {
@@ -38,7 +39,7 @@ BOUNDS = {
 }
 # A tenth of a density that is finer than its grid, a step in which half of the density is unknown, and a sample where the density
 # consists of rounding.
-LOST = {"tail_depth": 1.0, "aliasing": 0.1, "splitting_error": 0.5}
+LOST = {"tail_depth": 1.0, "aliasing": LOST_ALIASING, "splitting_error": 0.5}
 MANY = 4  # states that a grid is too coarse for
 HANDLES = features.OF_OBSERVATION | {
     features.CROSS_NOISE,

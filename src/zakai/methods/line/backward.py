@@ -10,31 +10,29 @@ Only the product of b with the filter's density matters: a message is kept where
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from zakai.densities import Density
-from zakai.methods._protocol import Backward, Info, Infos
+from zakai.methods._protocol import Backward, Info, Infos, joined, stacked
 from zakai.methods._states import Joined
 from zakai.methods.line import filter as line_filter
 from zakai.methods.line.backward_interval import negligible, pulled, smoothing_tolerance
 from zakai.methods.line.backward_loop import back
-from zakai.methods.line.loop import joined
 from zakai.methods.line.message import Message, points_of, reliable
 from zakai.methods.line.parts import cut
 from zakai.methods.line.paths import draw
 from zakai.methods.line.prepared import Parts, Prepared, State
-from zakai.methods.line.update import acting_inside, factor_of, state_moments, state_of
+from zakai.methods.line.update import acting_inside, factor_of, state_moments
+from zakai.numerics.arrays import Array
 from zakai.numerics.line import window as lw
 from zakai.numerics.line.density import support
-
-Array = Any
 
 KINKED = 16.0  # points of a likelihood with kinks in the spacing that a message needs
 
 
-def message(prepared: Prepared, state: State) -> Message:
+def last_message(prepared: Prepared, state: State) -> Message:
     """Return the message one at the last time."""
     return Message.of(np.zeros(len(state.values)), state.window, state.window.spacing, 0.0)
 
@@ -47,15 +45,15 @@ class _Product(NamedTuple):
     log_mass: float
 
 
-def _product(state: State, later: Message) -> _Product:
+def _product(state: State, message: Message) -> _Product:
     finer = state.window
-    if later.spacing < 0.9999 * finer.spacing:
+    if message.spacing < 0.9999 * finer.spacing:
         low, high = float(finer.offsets[0]), float(finer.offsets[-1])
-        if not finer.closed and later.spacing < 0.25 * finer.spacing:  # a message that is far narrower than the density
-            low, high = max(low, later.ends[0]), min(high, later.ends[1])
-        finer = points_of(finer, low, high, later.spacing)
+        if not finer.closed and message.spacing < 0.25 * finer.spacing:  # a message that is far narrower than the density
+            low, high = max(low, message.ends[0]), min(high, message.ends[1])
+        finer = points_of(finer, low, high, message.spacing)
     density = reliable(state, finer)
-    logs = np.where(density > 0, np.log(density) + later.at(finer.offsets), -np.inf)
+    logs = np.where(density > 0, np.log(density) + message.at(finer.offsets), -np.inf)
     top = float(np.max(logs))
     values = np.exp(logs - top)
     first, last = support(values, lw.CUT)
@@ -65,25 +63,25 @@ def _product(state: State, later: Message) -> _Product:
 
 
 @np.errstate(all="ignore")
-def smoothed(prepared: Prepared, state: State, later: Message) -> tuple[Message, Info]:
+def smoothed(prepared: Prepared, state: State, message: Message) -> tuple[Message, Info]:
     """Return the message, normalised and without what is negligible in its product with the state, and the product's report."""
-    return _smoothed(prepared, state, later, _product(state, later))
+    return _smoothed(prepared, state, message, _product(state, message))
 
 
 def segment(
-    prepared: Prepared, rows: slice, states: Sequence[State], later: Message, observed: np.ndarray
+    prepared: Prepared, rows: slice, states: Sequence[State], message: Message, observed: np.ndarray
 ) -> tuple[Message, Infos]:
     """Return the message at the start of the intervals of a slice, and the reports after each."""
     if prepared.parts is None:
-        return _of_whole(prepared, rows, states, later, observed)
-    return _of_parts(prepared.parts, rows, states[0], later, observed)
+        return _of_whole(prepared, rows, states, message, observed)
+    return _of_parts(prepared.parts, rows, states[0], message, observed)
 
 
-def _of_parts(parts: Parts, rows: slice, state: State, later: Message, observed: np.ndarray) -> tuple[Message, Infos]:
+def _of_parts(parts: Parts, rows: slice, state: State, message: Message, observed: np.ndarray) -> tuple[Message, Infos]:
     # What a report says of the step after it belongs to that interval's gain.
     inner, values, last = cut(parts, rows, observed)
     between, _ = line_filter.segment_of_whole(parts.prepared, inner, state, values)
-    result, infos = _of_whole(parts.prepared, inner, Joined([[state], between]), later, values)
+    result, infos = _of_whole(parts.prepared, inner, Joined([[state], between]), message, values)
     gained = infos.log_likelihood_increment
     health = {name: np.fmax.reduceat(figures, last) for name, figures in infos.health.items()}
     reports = Infos(np.add.reduceat(gained, last), infos.mean[last], infos.cov[last], health)
@@ -92,75 +90,73 @@ def _of_parts(parts: Parts, rows: slice, state: State, later: Message, observed:
 
 @np.errstate(all="ignore")
 def _of_whole(
-    prepared: Prepared, rows: slice, states: Sequence[State], later: Message, observed: np.ndarray
+    prepared: Prepared, rows: slice, states: Sequence[State], message: Message, observed: np.ndarray
 ) -> tuple[Message, Infos]:
     """Return the same of intervals that are not cut into parts."""
     parts: list[Infos] = []
     stop = rows.stop
     while stop > rows.start:
         place = stop - rows.start
-        result = _product(states[place], later)
-        later, info = _smoothed(prepared, states[place], later, result)
-        parts.append(line_filter.alone(info))
-        completed = back(prepared, slice(rows.start, stop), states, later, result.values, result.window, observed)
+        result = _product(states[place], message)
+        message, info = _smoothed(prepared, states[place], message, result)
+        parts.append(stacked([info]))
+        completed = back(prepared, slice(rows.start, stop), states, message, result.values, result.window, observed)
         if completed is None:
             stop -= 1
-            later = step(prepared, stop, later, observed[place - 1], states[place - 1])
+            message = step(prepared, stop, message, observed[place - 1], states[place - 1])
         else:
-            later, stop = completed.message, stop - completed.number
+            message, stop = completed.message, stop - completed.number
             parts.append(completed.infos)
-    return later, joined(parts[::-1])
+    return message, joined(parts[::-1])
 
 
-def _smoothed(prepared: Prepared, state: State, later: Message, result: _Product) -> tuple[Message, Info]:
+def _smoothed(prepared: Prepared, state: State, message: Message, result: _Product) -> tuple[Message, Info]:
     window = result.window
     check = lw.grid_check(result.values, window.closed, prepared.negligible)
     mean, variance = lw.moments(result.values, window)
     centre, deviation = float(mean), float(np.sqrt(max(variance, 0.0)))
     spacings = deviation / window.spacing
     mean, variance = state_moments(prepared, result.values, window, mean, variance)
-    if window.closed:
-        mean = mean - 2 * np.pi * np.ceil((mean - np.pi) / (2 * np.pi))
     health = {
-        "error_estimate": float(state.error) + later.error,
-        "tolerance_ratio": later.error / smoothing_tolerance(prepared),
+        "error_estimate": float(state.error) + message.error,
+        "tolerance_ratio": message.error / smoothing_tolerance(prepared),
         "edge_mass": max(check.left, check.right),
         "negative_mass": check.negative,
         "aliasing": check.aliasing,
         "std_in_spacings": spacings,
     }
     first, last = support(result.values, negligible(prepared))
-    needed = min(later.needed, window.spacing * max(check.resolving, 1.0), float(state.spacing))
+    needed = min(message.needed, window.spacing * max(check.resolving, 1.0), float(state.spacing))
     low, high = float(window.offsets[first]), float(window.offsets[last])
-    finer = later.spacing > 2.0 * needed  # few points hold more than the product
-    retained = later.on(points_of(later.window, low, high, needed)) if finer else later.between(low, high)
+    finer = message.spacing > 2.0 * needed  # few points hold more than the product
+    retained = message.on(points_of(message.window, low, high, needed)) if finer else message.between(low, high)
     retained = retained._replace(logs=retained.logs - result.log_mass, needed=needed, mean=centre, deviation=deviation)
     return retained, Info(result.log_mass, np.array([mean]), np.array([[variance]]), health)
 
 
 @np.errstate(all="ignore")
-def step(prepared: Prepared, k: int, later: Message, observed: np.ndarray, state: State) -> Message:
+def step(prepared: Prepared, k: int, message: Message, observed: np.ndarray, state: State) -> Message:
     """Return the message at the start of interval k from that at its end; `state` is the filter's at the start."""
     length = float(prepared.lengths[k])
     finer = KINKED if prepared.weak and prepared.schedule.seen[k].any() else 1.0
-    later = later.on(points_of(later.window, *later.ends, later.needed / finer)).between(*later.ends)
-    before = later.variance
-    inside, likelihood = acting_inside(prepared, k), factor_of(prepared, k, observed, later.window)
+    message = message.on(points_of(message.window, *message.ends, message.needed / finer)).between(*message.ends)
+    before = message.variance
+    inside, likelihood = acting_inside(prepared, k), factor_of(prepared, k, observed, message.window)
     if likelihood is not None:
-        later = later._replace(logs=later.logs + likelihood.logs(later.window.points).real)
+        message = message._replace(logs=message.logs + likelihood.logs(message.window.points).real)
     if length == 0:
-        return later
-    between = later.variance
-    later, made = pulled(prepared, prepared.interval(k, inside, observed), state, later)
-    retained = float(np.clip(later.scaled * between / np.sqrt(max(before * later.variance, 1e-300)), 0.3, 1.0))
-    return later._replace(error=made + retained * later.error, scaled=1.0)
+        return message
+    between = message.variance
+    message, made = pulled(prepared, prepared.interval(k, inside, observed), state, message)
+    retained = float(np.clip(message.scaled * between / np.sqrt(max(before * message.variance, 1e-300)), 0.3, 1.0))
+    return message._replace(error=made + retained * message.error, scaled=1.0)
 
 
 @np.errstate(all="ignore")
-def density(prepared: Prepared, state: State, later: Message) -> Density:
+def density(prepared: Prepared, state: State, message: Message) -> Density:
     """Return the smoothed density."""
-    result = _product(state, later)
-    return line_filter.density(prepared, state_of(result.values, result.window, state.error, state.log_floor))
+    result = _product(state, message)
+    return line_filter.density(prepared, State.of(result.values, result.window, state.error, state.log_floor))
 
 
 def accuracy(prepared: Prepared) -> float:
@@ -168,4 +164,4 @@ def accuracy(prepared: Prepared) -> float:
     return max(1e-6, prepared.promised)
 
 
-BACKWARD: Backward[Prepared, State, Message] = Backward(message, step, smoothed, density, segment, draw, accuracy)
+BACKWARD: Backward[Prepared, State, Message] = Backward(last_message, step, smoothed, density, segment, draw, accuracy)

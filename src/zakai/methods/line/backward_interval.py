@@ -3,50 +3,38 @@
 A Gaussian kernel is a sum over a grid.  On the circle the transposed exponentials of the filter act, on the line a grid that
 moves (`line/gauged.py`) where the drift carries the density.  Else, where no coefficient depends on t and no increments act
 within, a grid covers the support of the message at the end of the interval, that of the density at its start, and the paths
-between them; psi is moved by its decomposition.  Else grids are fixed (`line/gauged.py`).  Other intervals are for finite
-volumes (`line/volumes.py`).
+between them; psi is moved by its decomposition.  Other intervals are for finite volumes (`line/volumes.py`).
 """
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
-from zakai.methods.line.coefficients import covariance_at, resolved_parts
+from zakai.methods.line.coefficients import covariance_at, resolved_parts, travel
 from zakai.methods.line.domain import ends_of_leak
-from zakai.methods.line.gauged import by_fixed_grids, by_moving_grid
+from zakai.methods.line.gauged import by_moving_grid
 from zakai.methods.line.kernel import kernel_of
 from zakai.methods.line.message import Message, covering, gauged, points_of, reliable, taper
 from zakai.methods.line.prepared import Prepared, State, TimeInterval
 from zakai.methods.line.report import Report
-from zakai.methods.line.transition import MOST_SUBSTEPS, Substep, parts_of_split, travel, trial_substep
+from zakai.methods.line.transition import MOST_SUBSTEPS, Substep, parts_of_split, trial_substep
 from zakai.methods.line.volumes import WIDENINGS, cell_plan_of, ends_of, pulled_back
+from zakai.numerics.arrays import Array
 from zakai.numerics.line import window as lw
-from zakai.numerics.line.backward import EXCURSION, FEWEST, ROUNDING
+from zakai.numerics.line.backward import EXCURSION, FEWEST, SMALLEST
 from zakai.numerics.line.density import support
-from zakai.numerics.line.resolution import ROUNDING as PRECISION
-from zakai.numerics.line.resolution import SMOOTHER_SHARE, SPECTRUM_FACTOR, TRIALS
+from zakai.numerics.line.resolution import ROUNDING, SMOOTHER_SHARE, SPECTRUM_FACTOR, TRIALS
 from zakai.numerics.line.window import local_polynomial
 
-Array = Any
 
 def by_exponentials(
-    prepared: Prepared, interval: TimeInterval, state: State, later: Message, accepted: float
+    prepared: Prepared, interval: TimeInterval, state: State, message: Message, accepted: float
 ) -> tuple[Message, float] | None:
-    """Return the message at the start of an interval, and the error that the interval adds; None where this does not serve.
-
-    Args:
-        prepared: the system.
-        interval: the interval.
-        state: the filter's state at its start.
-        later: the message at its end.
-        accepted: the values relative to the maximum that do not count.
-    """
-    spacing = later.needed
+    """Return what `pulled` returns, by transposed exponentials; None where they do not serve.  Less than `accepted` is none."""
+    spacing = message.needed
     for _ in range(TRIALS):
-        window = covering(later.window, 0.0, 0.0, min(spacing, state.spacing))
-        values = np.exp(later.at(window.offsets) - np.max(later.logs))
+        window = covering(message.window, 0.0, 0.0, min(spacing, state.spacing))
+        values = np.exp(message.at(window.offsets) - np.max(message.logs))
         values, top, error = _transposed(prepared, values, window, interval)
         check = lw.grid_check(values, True, accepted)
         if check.aliasing <= accepted or window.size >= lw.LARGEST:
@@ -54,16 +42,14 @@ def by_exponentials(
         spacing = window.spacing / 1.5
     else:
         return None
-    density, least = reliable(state, window), ROUNDING * float(np.max(values))
+    density, least = reliable(state, window), SMALLEST * float(np.max(values))
     error += 2.0 * check.aliasing + least * float(np.sum(density) / (density @ values))
     needed = window.spacing * float(np.clip(check.resolving, 1.0, 2.0))
-    logs = np.log(np.maximum(values, least)) + top + float(np.max(later.logs))
-    return Message.of(logs, window, needed, later.error), error
+    logs = np.log(np.maximum(values, least)) + top + float(np.max(message.logs))
+    return Message.of(logs, window, needed, message.error), error
 
 
-def _transposed(
-    prepared: Prepared, values: Array, window: lw.Window, interval: TimeInterval
-) -> tuple[Array, float, float]:
+def _transposed(prepared: Prepared, values: Array, window: lw.Window, interval: TimeInterval) -> tuple[Array, float, float]:
     """Return a message at the start of an interval, of the sum one, the logarithm of the sum before, and the error."""
     _, start, length, inside, rates = interval
     total = float(np.sum(values))
@@ -80,12 +66,12 @@ def _transposed(
             continue
         total = float(np.sum(trial.values))
         error += np.inf if trial.split else trial.error
-        top += trial.offset + float(np.log(total))
+        top += float(trial.offset.real + np.log(total))
         values = trial.values / total
     return values, top, error
 
 
-RESOLVED = 0.25  # spacing in standard deviations of the noise
+SPACING_OF_NOISE = 0.25  # spacing in standard deviations of the noise
 WIDTH = 0.8  # spacing in standard deviations of a Gaussian kernel at which sums are integrals
 MOST_POINTS = 4000  # of such sums
 
@@ -100,92 +86,90 @@ def smoothing_tolerance(prepared: Prepared) -> float:
     return max(prepared.tolerance, 1e-6)
 
 
-def pulled(prepared: Prepared, interval: TimeInterval, state: State, later: Message) -> tuple[Message, float]:
+def pulled(prepared: Prepared, interval: TimeInterval, state: State, message: Message) -> tuple[Message, float]:
     """Return the message at the start of an interval, and the error that the interval adds.
 
     Args:
-        prepared: the system.
-        interval: the interval.
         state: the filter's state at its start.
-        later: the message at its end.
+        message: the message at its end.
     """
     own, accepted = state.window, negligible(prepared)
     low, high = support(np.ascontiguousarray(state.values.real), 1e-13)
     ends = float(own.offsets[low]), float(own.offsets[high])
-    result = _by_kernel(prepared, interval, ends, later)
+    result = _by_kernel(prepared, interval, ends, message)
     if result is not None:
         return result
-    if later.closed:
-        dense = by_exponentials(prepared, interval, state, later, accepted)
+    if message.closed:
+        dense = by_exponentials(prepared, interval, state, message, accepted)
         if dense is not None:
             return dense
     leak = ends_of_leak(prepared, own, np.array(ends), interval.start, interval.length)
     if leak is not None:  # a grid loses mass at a natural end, in both directions of time
-        result = _by_volumes(prepared, interval, state, ends, later, leak)
+        result = _by_volumes(prepared, interval, state, ends, message, leak)
         if result[1] <= smoothing_tolerance(prepared):
             return result
-    arguments, dense = (prepared, interval, state, later, accepted), None
+    dense = None
     if travel(prepared, np.asarray(state.values), own, interval.start, interval.length) > 0.0:
-        dense = by_moving_grid(*arguments)
+        dense = by_moving_grid(prepared, interval, state, message, accepted)
         if dense is not None and dense[1] <= smoothing_tolerance(prepared):
             return dense
-    result = _by_modes(prepared, interval, state, ends, later) or by_fixed_grids(*arguments)
+    result = _by_modes(prepared, interval, state, ends, message)
     if result is not None:
         return result
-    result = _by_volumes(prepared, interval, state, ends, later)
+    result = _by_volumes(prepared, interval, state, ends, message)
     return dense if dense is not None and dense[1] < result[1] else result
 
 
 def _by_kernel(
-    prepared: Prepared, interval: TimeInterval, ends: tuple[float, float], later: Message
+    prepared: Prepared, interval: TimeInterval, ends: tuple[float, float], message: Message
 ) -> tuple[Message, float] | None:
     """Return the same of an interval whose kernel is Gaussian, None where it is not or needs many points."""
-    if prepared.yau is None or later.closed:
+    if prepared.yau is None or message.closed:
         return None
     report, k = Report(), interval.k
-    kernel = kernel_of(prepared, interval, later.window, report)
-    if kernel is None or not kernel.variance > 0:
+    kernel = kernel_of(prepared, interval, message.window, report)
+    if kernel is None or not kernel.variance.real > 0:
         return None
-    deviation, (low, high) = float(np.sqrt(kernel.variance)), later.ends
+    deviation, (low, high) = float(np.sqrt(kernel.variance)), message.ends
     if (high - low) > MOST_POINTS * WIDTH * deviation:
         return None
-    spacing = min(max(later.needed, RESOLVED * deviation) / max(abs(kernel.scale), 1e-3), (ends[1] - ends[0]) / FEWEST)
-    fine = points_of(later.window, low, high, min(later.spacing, WIDTH * deviation))
-    new = points_of(later.window, *ends, spacing)
+    spacing = min(max(message.needed, SPACING_OF_NOISE * deviation) / max(abs(kernel.scale), 1e-3), (ends[1] - ends[0]) / FEWEST)
+    fine = points_of(message.window, low, high, min(message.spacing, WIDTH * deviation))
+    new = points_of(message.window, *ends, spacing)
     x, y, theta = fine.offsets, new.offsets, prepared.theta.real
-    after = later.at(x) + prepared.yau.potential(fine.points, float(prepared.schedule.stops[k]), theta)
+    after = message.at(x) + prepared.yau.potential(fine.points, float(prepared.schedule.stops[k]), theta)
     logs = after - 0.5 * ((x - kernel.scale * y[:, None] - kernel.shift) / deviation) ** 2
     top = np.max(logs, axis=1)
     result = np.log(np.sum(np.exp(logs - top[:, None]), axis=1) * fine.spacing / (deviation * np.sqrt(2 * np.pi))) + top
     result += kernel.constant + y * (kernel.slope + kernel.curvature * y)
     result -= prepared.yau.potential(new.points, float(prepared.schedule.starts[k]), theta)
-    return Message.of(result, new, new.spacing, later.error), report.time
+    return Message.of(result, new, new.spacing, message.error), report.time
 
 
 def _by_modes(
-    prepared: Prepared, interval: TimeInterval, state: State, ends: tuple[float, float], later: Message
+    prepared: Prepared, interval: TimeInterval, state: State, ends: tuple[float, float], message: Message
 ) -> tuple[Message, float] | None:
     """Return the same by a decomposition, None where there is none or rounding in psi counts."""
     if prepared.system.varying or prepared.system.rough or interval.inside.any():
         return None
     length, accepted = interval.length, max(negligible(prepared), SPECTRUM_FACTOR * prepared.negligible)
-    low, high = min(later.ends[0], ends[0]), max(later.ends[1], ends[1])
+    low, high = min(message.ends[0], ends[0]), max(message.ends[1], ends[1])
     least, most = _noise(prepared, interval.k, state.origin + low, state.origin + high)
     low, high = low - EXCURSION * most, high + EXCURSION * most  # paths from one support to the other leave both
-    spacing = max(later.needed, RESOLVED * least)
+    spacing = max(message.needed, SPACING_OF_NOISE * least)
     for trial in range(TRIALS):
-        window = covering(later.window, low, high, spacing)
+        window = covering(message.window, low, high, spacing)
         if window.size > lw.LARGE:
             return None
         operator = gauged(prepared, window)
         if operator is None:
             return None
-        psi, top = _psi(later, window, operator.logs)
+        psi, top = _psi(message, window, operator.logs)
         propagated, growth = operator.decayed(psi, length), max(1.0, float(np.exp(-length * operator.rates[0])))
         highest = float(np.max(propagated))
         if not 0.0 < highest < np.inf:
             return None
-        error = PRECISION * float(np.sqrt(np.sum(psi * psi))) * growth / highest
+        error = ROUNDING * float(np.sqrt(np.sum(psi * psi))) * growth / highest
         if not _exact(prepared, state, propagated, operator.logs, window, error):
             return None
         check = lw.grid_check(propagated, False, accepted)
@@ -197,18 +181,18 @@ def _by_modes(
     if made > smoothing_tolerance(prepared):
         return None
     assert operator is not None
-    logs = np.log(np.maximum(propagated, ROUNDING * highest) / window.spacing) - operator.logs + top
+    logs = np.log(np.maximum(propagated, SMALLEST * highest) / window.spacing) - operator.logs + top
     needed = window.spacing * float(np.clip(check.resolving, 1.0, 2.0))
-    return Message.of(logs, window, needed, later.error).between(*ends), made
+    return Message.of(logs, window, needed, message.error).between(*ends), made
 
 
-def _psi(later: Message, window: lw.Window, gauge: Array) -> tuple[Array, float]:
+def _psi(message: Message, window: lw.Window, gauge: Array) -> tuple[Array, float]:
     """Return the values of psi on a grid times its spacing, divided by the exponential of the second number."""
-    finer = window.spacing > 1.01 * later.spacing
-    fine = covering(later.window, *later.ends, later.spacing) if finer else window
-    logs = later.falling(fine.offsets) + (local_polynomial(gauge, window, fine.offsets) if finer else gauge)
+    finer = window.spacing > 1.01 * message.spacing
+    fine = covering(message.window, *message.ends, message.spacing) if finer else window
+    logs = message.falling(fine.offsets) + (local_polynomial(gauge, window, fine.offsets) if finer else gauge)
     top = float(np.max(logs))
-    values = fine.spacing * np.exp(logs - top) * taper(fine.offsets, later.ends, fine.spacing)
+    values = fine.spacing * np.exp(logs - top) * taper(fine.offsets, message.ends, fine.spacing)
     # Integrals of psi with what the coarse grid resolves.
     return lw.gathered(values, fine.offsets, window) if finer else values, top
 
@@ -220,7 +204,7 @@ def _exact(prepared: Prepared, state: State, psi: Array, gauge: Array, window: l
         density = reliable(state, own)
         density, offsets = density[density > 0.0], own.offsets[density > 0.0]
         log_gauge = local_polynomial(gauge, window, offsets)
-        log_psi = local_polynomial(np.log(np.maximum(psi, ROUNDING * top) / top), window, offsets)
+        log_psi = local_polynomial(np.log(np.maximum(psi, SMALLEST * top) / top), window, offsets)
     else:
         density = reliable(state, window)
         inside = density > 0.0
@@ -228,15 +212,16 @@ def _exact(prepared: Prepared, state: State, psi: Array, gauge: Array, window: l
     logs, product = np.log(density) - log_gauge, np.log(density) - log_gauge + log_psi
     shift = np.max(product)
     allowed = SMOOTHER_SHARE * smoothing_tolerance(prepared)
-    return bool(max(error, ROUNDING) * np.sum(np.exp(logs - shift)) < allowed * np.sum(np.exp(product - shift)))
+    return bool(max(error, SMALLEST) * np.sum(np.exp(logs - shift)) < allowed * np.sum(np.exp(product - shift)))
 
 
 def _by_volumes(
-    prepared: Prepared, interval: TimeInterval, state: State, ends: tuple[float, float], later: Message, leak: Array | None = None
-) -> tuple[Message, float]:
+    prepared: Prepared, interval: TimeInterval, state: State, ends: tuple[float, float], message: Message,
+    leak: Array | None = None,
+) -> tuple[Message, float]:  # fmt: skip
     """Return the same by finite volumes, of infinite error where they do not serve; with a leak they reach its ends."""
     values, window = np.asarray(state.values).real, state.window
-    mean, variance = later.moments
+    mean, variance = message.moments
     widening = np.inf if leak is None else WIDENINGS[-1] * (ends[1] - ends[0])
     plan = cell_plan_of(prepared, values, window, ends_of(values, window), interval, (mean, variance**0.5), widening)
     if plan is not None and leak is not None:
@@ -245,15 +230,15 @@ def _by_volumes(
     def density(offsets: Array) -> Array:
         return lw.density_at(values, window, offsets)
 
-    result = pulled_back(prepared, later.falling, density, plan, interval)
+    result = pulled_back(prepared, message.falling, density, plan, interval)
     if result is None:
-        return later._replace(logs=np.full(len(later.logs), np.nan)), np.inf
-    least, _ = _noise(prepared, interval.k, *(state.origin + np.array(later.ends)))
-    needed = min(max(later.needed, 0.5 * RESOLVED * least), window.spacing)
+        return message._replace(logs=np.full(len(message.logs), np.nan)), np.inf
+    least, _ = _noise(prepared, interval.k, *(state.origin + np.array(message.ends)))
+    needed = min(max(message.needed, 0.5 * SPACING_OF_NOISE * least), window.spacing)
     new = points_of(window, *ends, needed)
     values = result.at(new.offsets)
-    logs = np.log(np.maximum(values, ROUNDING * np.max(values))) + result.log_scale
-    return Message.of(logs, new, needed, later.error), result.error
+    logs = np.log(np.maximum(values, SMALLEST * np.max(values))) + result.log_scale
+    return Message.of(logs, new, needed, message.error), result.error
 
 
 def _noise(prepared: Prepared, k: int, low: float, high: float) -> tuple[float, float]:

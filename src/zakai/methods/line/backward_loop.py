@@ -6,30 +6,27 @@ The message is moved on the grids of the filter.  An interval that the loop refu
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from zakai.methods._protocol import Infos
 from zakai.methods.line.backward_interval import negligible, smoothing_tolerance
-from zakai.methods.line.coefficients import covariance_at
-from zakai.methods.line.loop import TOGETHER, grid_of
-from zakai.methods.line.message import LOWEST, PAD, SURE, Message, gauged, taper
+from zakai.methods.line.coefficients import covariance_at, displaced
+from zakai.methods.line.loop import INTERVALS_TOGETHER, grid_of
+from zakai.methods.line.message import LOWEST, PAD, SURE_OF_DENSITY, Message, gauged, taper
 from zakai.methods.line.prepared import SHARE, Prepared, State
-from zakai.methods.line.transition import displaced
 from zakai.methods.line.update import factor_at_end, state_moments
+from zakai.numerics.arrays import Array
 from zakai.numerics.line import backward as lb
 from zakai.numerics.line import window as lw
 from zakai.numerics.line.backward import EXCURSION, by_adjoints
 from zakai.numerics.line.density import support
-from zakai.numerics.line.resolution import ROUNDING as PRECISION
-from zakai.numerics.line.resolution import SMOOTHER_SHARE
+from zakai.numerics.line.resolution import ROUNDING, SMOOTHER_SHARE
 from zakai.numerics.line.steps import SPLIT, SPLIT_FACTOR
 
-Array = Any
-
 STRIDES = (1, 2, 4)  # points of psi in a spacing of the filter's grid
-APART = 32  # the ends of a grid for a decomposition are multiples of so many spacings
+SPACINGS_APART = 32  # the ends of a grid for a decomposition are multiples of so many spacings
 
 
 class BackwardSegment(NamedTuple):
@@ -41,15 +38,13 @@ class BackwardSegment(NamedTuple):
 
 
 def back(
-    prepared: Prepared, rows: slice, states: Sequence[State], later: Message, product: Array, grid: lw.Window, observed: Array
+    prepared: Prepared, rows: slice, states: Sequence[State], message: Message, product: Array, grid: lw.Window, observed: Array
 ) -> BackwardSegment | None:
     """Take a message back over the last of some intervals, None where the loop takes none of them.
 
     Args:
-        prepared: the system.
-        rows: the intervals.
         states: those of the filter before and after them.
-        later: the message after the last interval.
+        message: the message after the last interval.
         product, grid: the smoothed density at the same time, and its grid.
         observed: the observations (K, m).
     """
@@ -57,11 +52,11 @@ def back(
     split = prepared.gaussian
     if prepared.kinked or not _served(prepared, k) or not (split or _exact(prepared, k, states[k - first])):
         return None
-    shared = _shared(states[k - first], states[k - first + 1].window, later, product, grid)
+    shared = _shared(states[k - first], states[k - first + 1].window, message, product, grid)
     if split and shared and not shared[-1].closed:
         shared.append(lw.refined(shared[-1], 2.0))  # for a kernel that is narrow in spacings
     for window in shared:
-        begin, most = k, TOGETHER
+        begin, most = k, INTERVALS_TOGETHER
         own = states[k - first].window
         if not _holds(window, *own.offsets[[0, -1]]) or (split and window.spacing < own.spacing):
             most = 1
@@ -75,7 +70,7 @@ def back(
         before = states[begin - first : k + 1 - first]
         for stride in (0,) if split else STRIDES:
             values = observed[begin - first : k + 1 - first]
-            completed = _on_one_grid(prepared, here, before, later, (product, grid), window, stride, values)
+            completed = _on_one_grid(prepared, here, before, message, (product, grid), window, stride, values)
             if completed is not None:
                 return completed
     return None
@@ -101,16 +96,16 @@ def _exact(prepared: Prepared, k: int, state: State) -> bool:
     displacement, _ = displaced(prepared, values, state.window, start, length)
     noise = length * covariance_at(prepared.system, np.array([state.origin + mean]), start, prepared.theta.real)
     lost = displacement**2 / noise * (1.0 + variance / noise)
-    return bool(np.all(lost < np.log(SMOOTHER_SHARE * smoothing_tolerance(prepared) / PRECISION)))
+    return bool(np.all(lost < np.log(SMOOTHER_SHARE * smoothing_tolerance(prepared) / ROUNDING)))
 
 
 def _on_one_grid(
-    prepared: Prepared, here: slice, before: Sequence[State], later: Message, smoothed: tuple[Array, lw.Window],
+    prepared: Prepared, here: slice, before: Sequence[State], message: Message, smoothed: tuple[Array, lw.Window],
     window: lw.Window, stride: int, observed: Array,
 ) -> BackwardSegment | None:  # fmt: skip
     """Return the message before intervals, on one grid, None where none is accurate."""
     limits = lb.Limits(smoothing_tolerance(prepared), SHARE * prepared.tolerance, negligible(prepared), prepared.cut)
-    now, start, longer, gauge = lw.resampled(*smoothed, window), 0, window, np.zeros(1)
+    product, start, longer, gauge = lw.resampled(*smoothed, window), 0, window, np.zeros(1)
     filtered, centres = _before(before, window)
     if not stride:
         table = grid_of(prepared, window, here)
@@ -119,9 +114,9 @@ def _on_one_grid(
         start = table.start
         filtered, ends = filtered._replace(starts=filtered.starts + start), np.append(centres[1:], window.centre)
         logs = log_likelihoods(prepared, here, observed, window.origin + ends[:, None] + window.spacing * lw.index(window.size))
-        message, steps = _on(later, window, start, now), prepared.steps.part(here)
+        on_grid, steps = _on(message, window, start, product), prepared.steps.part(here)
         observed = np.ascontiguousarray(observed, float)
-        completed = by_adjoints(message, filtered, table, steps, lb.Observed(logs, observed, window.closed), limits)
+        completed = by_adjoints(on_grid, filtered, table, steps, lb.Observed(logs, observed, window.closed), limits)
     else:
         lengths = np.ascontiguousarray(prepared.lengths[here])
         longer = _longer(prepared, window, stride, float(np.max(lengths)))
@@ -130,7 +125,7 @@ def _on_one_grid(
             return None
         logs, gauge = log_likelihoods(prepared, here, observed, longer.points[None]), operator.logs
         known = lb.Gauged(np.ascontiguousarray(operator.modes.T), operator.rates, gauge, _place(window, longer, stride), stride)
-        completed = lb.by_modes(_psi(later, longer, gauge, now), filtered, known, logs, lengths, window.closed, limits)
+        completed = lb.by_modes(_psi(message, longer, gauge, product), filtered, known, logs, lengths, window.closed, limits)
     if not completed.number:
         return None
     reports, result = completed.reports, completed.message
@@ -148,7 +143,7 @@ def _on_one_grid(
 def _before(states: Sequence[State], window: lw.Window) -> tuple[lb.Filtered, Array]:
     """Return the filter's densities on grids of one spacing and size, and the centres of these."""
     own, values = states[0].window, np.array([state.values for state in states])
-    floors = SURE * np.exp(np.minimum([float(state.log_floor) for state in states], LOWEST))
+    floors = SURE_OF_DENSITY * np.exp(np.minimum([float(state.log_floor) for state in states], LOWEST))
     centres = np.array([state.centre for state in states])
     if (own.spacing, own.size) != (window.spacing, window.size) or (len(states) == 1 and own != window):
         values, centres = np.array([lw.resampled(one, own, window) for one in values]), np.full(len(states), window.centre)
@@ -170,11 +165,11 @@ def log_likelihoods(prepared: Prepared, here: slice, observed: Array, points: Ar
     return np.where(logs.real > -1e8, logs, -1e8)
 
 
-def _shared(state: State, after: lw.Window, later: Message, product: Array, grid: lw.Window) -> list[lw.Window]:
+def _shared(state: State, after: lw.Window, message: Message, product: Array, grid: lw.Window) -> list[lw.Window]:
     """Return the grids that may serve for all of an interval: those before and after it, and finer ones."""
     own = state.window
     first, last = support(np.ascontiguousarray(state.values.real), lw.CUT)
-    low, high = min(own.offsets[first], later.ends[0]), max(own.offsets[last], later.ends[1])
+    low, high = min(own.offsets[first], message.ends[0]), max(own.offsets[last], message.ends[1])
     result = []
     for window in sorted({own, after}, key=lambda window: window.spacing, reverse=True):
         if _holds(window, low, high):
@@ -190,27 +185,27 @@ def _holds(window: lw.Window, low: float, high: float) -> bool:
     return bool(window.closed or first <= low <= high <= last)
 
 
-def _on(later: Message, window: lw.Window, start: int, product: Array) -> lb.Message:
+def _on(message: Message, window: lw.Window, start: int, product: Array) -> lb.Message:
     """Return a message on a grid."""
     offsets, size = window.offsets, window.size
     first, last = 0, size - 1
     if not window.closed:
-        first = int(np.searchsorted(offsets, later.ends[0] - 1e-6 * window.spacing))
-        last = int(np.searchsorted(offsets, later.ends[1] + 1e-6 * window.spacing)) - 1
+        first = int(np.searchsorted(offsets, message.ends[0] - 1e-6 * window.spacing))
+        last = int(np.searchsorted(offsets, message.ends[1] + 1e-6 * window.spacing)) - 1
     logs = np.full(size, -np.inf)
-    logs[first : last + 1] = later.at(offsets[first : last + 1])
+    logs[first : last + 1] = message.at(offsets[first : last + 1])
     scale = float(np.max(logs))
-    return lb.Message(np.exp(logs - scale), scale, first, last, start, later.error, product)
+    return lb.Message(np.exp(logs - scale), scale, first, last, start, message.error, product)
 
 
-def _psi(later: Message, window: lw.Window, gauge: Array, product: Array) -> lb.Message:
+def _psi(message: Message, window: lw.Window, gauge: Array, product: Array) -> lb.Message:
     """Return psi = F e^s b of a message on a grid."""
-    logs = later.at(window.offsets) + gauge
+    logs = message.at(window.offsets) + gauge
     scale = float(np.max(logs))
     values = np.exp(logs - scale)
     if not window.closed:
-        values = values * taper(window.offsets, later.ends, window.spacing)
-    return lb.Message(values, scale, 0, window.size - 1, 0, later.error, product)
+        values = values * taper(window.offsets, message.ends, window.spacing)
+    return lb.Message(values, scale, 0, window.size - 1, 0, message.error, product)
 
 
 def _longer(prepared: Prepared, window: lw.Window, stride: int, length: float) -> lw.Window:
@@ -222,8 +217,8 @@ def _longer(prepared: Prepared, window: lw.Window, stride: int, length: float) -
     reach = EXCURSION * float(np.sqrt(np.max(covariance) * length)) / spacing
     reach = PAD + 2.0 ** (1.0 + 2.0 * np.ceil(0.5 * np.log2(np.clip(reach, 8.0, lw.LARGE) / 2.0)))
     begin = stride * _first(window)
-    low = int(APART * np.floor((begin - reach) / APART))
-    size = int(APART * np.ceil((begin + stride * window.size + reach) / APART)) - low
+    low = int(SPACINGS_APART * np.floor((begin - reach) / SPACINGS_APART))
+    size = int(SPACINGS_APART * np.ceil((begin + stride * window.size + reach) / SPACINGS_APART)) - low
     return window._replace(centre=spacing * (low + size // 2), size=size, spacing=spacing)
 
 

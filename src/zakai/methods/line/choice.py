@@ -9,22 +9,23 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from zakai.methods.line.coefficients import on_grid_for_drift
+from zakai.methods.line.coefficients import on_grid_for_drift, travel
 from zakai.methods.line.kernel import by_kernel, kernel_of
 from zakai.methods.line.prepared import Prepared, TimeInterval
 from zakai.methods.line.report import Report
-from zakai.methods.line.transition import MOVING, Prediction, by_decomposition, by_substeps, travel
+from zakai.methods.line.transition import Prediction, by_decomposition, by_substeps
 from zakai.methods.line.update import refitted
 from zakai.methods.line.volumes import contracted
+from zakai.numerics.arrays import Array
 from zakai.numerics.line import window as lw
 from zakai.numerics.line.gaussian_kernels import Channel
 from zakai.numerics.line.grid_choice import FAR
 
-Array = Any
+MOVING = 0.3  # ranges of a density that it moves in an interval without modes, above which grids move with it
 
 
 @dataclass
@@ -143,6 +144,8 @@ def predicted(
     prepared: Prepared, values: Array, window: lw.Window, interval: TimeInterval, report: Report
 ) -> tuple[Prediction, float]:
     """Return the density after an interval that is filtered alone, and the factor by which its kernel contracts deviations."""
+    if not np.isfinite(values.real).all():  # a density that is lost stays lost
+        return Prediction(values, window, np.float64(np.nan), None), 1.0
     kernel = kernel_of(prepared, interval, window, report)
     density = Density(prepared, values, window, interval, report, kernel)
     for mechanism in MECHANISMS:

@@ -12,20 +12,19 @@ sense of Stratonovich.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from zakai.methods.line.cache import Derived
 from zakai.methods.line.model import System, finite, within
 from zakai.methods.line.prepared import Prepared, TimeInterval
+from zakai.numerics.arrays import Array, Number
 from zakai.numerics.line import window as lw
 from zakai.numerics.line.averages import GAUSS_NODES, GAUSS_WEIGHTS, Panels, panels
-from zakai.numerics.line.grid_choice import PER, PROFILE
+from zakai.numerics.line.grid_choice import PER, PROFILE, REACH
 from zakai.numerics.line.operator import Spectral, symmetric
-from zakai.numerics.line.product import PARTS, at_nodes, nodes, weak
-
-Array = Any
+from zakai.numerics.line.product import NODES_OF_SPACING, at_nodes, nodes, weak
 
 _MIDPOINTS = (np.arange(32) + 0.5) / 32.0 - 0.5
 
@@ -35,10 +34,10 @@ class Tables(NamedTuple):
 
     drift: Array
     observation: Array
-    covariance: Any
+    covariance: Array
 
 
-def tables(prepared: Prepared, window: lw.Window) -> Tables:
+def tables(prepared: Prepared, window: lw.Points) -> Tables:
     """Return the tables of a grid."""
     system, theta, start = prepared.system, prepared.theta, prepared.model.start
 
@@ -73,7 +72,7 @@ def profile_of(prepared: Prepared, window: lw.Window) -> Array:
     return result
 
 
-def drift_at(system: System, window: lw.Window, t: Array, theta: Array) -> Array:
+def drift_at(system: System, window: lw.Points, t: Array | float, theta: Array) -> Array:
     """Return f at the points of a grid and times (...), (..., N).
 
     Of an f with jumps it is the mean over the spacing around a point, less the second difference that a smooth f adds to it.
@@ -84,10 +83,10 @@ def drift_at(system: System, window: lw.Window, t: Array, theta: Array) -> Array
     around = window.origin + window.centre + window.spacing * (np.arange(-1, window.size + 1) - window.size // 2)
     nodes = (around[:, None] + window.spacing * _MIDPOINTS).reshape(-1, 1)
     means = finite(system.drift(nodes, times, theta)[..., 0]).reshape(*times.shape[:-1], window.size + 2, -1).mean(axis=-1)
-    return means[..., 1:-1] - (means[..., 2:] - 2.0 * means[..., 1:-1] + means[..., :-2]) / 24.0
+    return np.asarray(means[..., 1:-1] - (means[..., 2:] - 2.0 * means[..., 1:-1] + means[..., :-2]) / 24.0)
 
 
-def covariance_at(system: System, points: Array, t: Array, theta: Array) -> Array:
+def covariance_at(system: System, points: Array, t: Array | float, theta: Array) -> Array:
     """Return G at points (..., N) and times (...): (..., N), or (...) if it is constant; zero where g has no value."""
     if system.state_dependent:
         result = finite(system.covariance(points[..., None], np.asarray(t)[..., None], theta)[..., 0, 0])
@@ -95,7 +94,7 @@ def covariance_at(system: System, points: Array, t: Array, theta: Array) -> Arra
     return system.covariance(np.zeros((*np.shape(t), 1)), t, theta)[..., 0, 0]
 
 
-def covariance_between(system: System, window: lw.Window, t: Array, theta: Array) -> Array:
+def covariance_between(system: System, window: lw.Window, t: Array | float, theta: Array) -> Array:
     """Return G half a spacing below each point of a grid, on the line also above the last one."""
     ends = np.concatenate([window.points - 0.5 * window.spacing, window.points[-1:] + 0.5 * window.spacing])
     return covariance_at(system, ends[:-1] if window.closed else ends, t, theta)
@@ -109,9 +108,7 @@ def gauge_at(prepared: Prepared, points: Array, parts: int = 1) -> Array:
     return np.append(0.0, np.cumsum(steps * (slopes.reshape(len(steps), parts, -1) @ GAUSS_WEIGHTS).sum(axis=1)))
 
 
-def decomposed(
-    prepared: Prepared, window: lw.Window, largest: int, ends: tuple[Array, Array] | None = None
-) -> Spectral | None:
+def decomposed(prepared: Prepared, window: lw.Window, largest: int, ends: tuple[Array, Array] | None = None) -> Spectral | None:
     """Return the decomposition of the operator on a grid of at most so many points, None where there is none.
 
     With `ends`, F'/F and its derivative (N,) of a function F, the drift in the symmetric operator is f + G F'/F.
@@ -123,7 +120,9 @@ def decomposed(
         return None
     if not (covariance.real > 0).all():
         return None
-    points, parts, spread, curvature, scale = window.points[:, None], PARTS if system.rough else 1, 0.0, 0.0, 1.0
+    points, parts = window.points[:, None], NODES_OF_SPACING if system.rough else 1
+    spread = curvature = np.zeros(1)
+    scale = np.ones(1)
     gauge = gauge_at(prepared, np.append(window.points, window.points[-1] + window.spacing), parts)
     if system.rough and not window.closed:
         x = nodes(window.points, window.spacing)
@@ -153,14 +152,20 @@ def decomposed(
 GROWTH = 12.0  # largest growth by the potential in one substep where there is no mass, as a logarithm
 
 
-def coefficients(
-    prepared: Prepared, window: lw.Window, times: np.ndarray, inside: np.ndarray, rates: np.ndarray, values: Array,
-    shifts: Array | None = None,
-) -> tuple[Array, Array, Array, Array]:  # fmt: skip
-    """Return f (T, N), G (T,) or (T, N), V less a constant (T, N) and the constant (T,).
+class Coefficients(NamedTuple):
+    """f (T, N), G (T,) or (T, N), V less a constant (T, N) and the constant (T,), at T times and N points."""
 
-    At the times the points of the grid are displaced by `shifts` (T,) or (T, N).
-    """
+    drift: Array
+    covariance: Array
+    potential: Array
+    constant: Array
+
+
+def coefficients(
+    prepared: Prepared, window: lw.Points, times: np.ndarray, inside: np.ndarray, rates: np.ndarray, values: Array,
+    shifts: Array | None = None,
+) -> Coefficients:  # fmt: skip
+    """Return the coefficients at times (T,), at which the points of the grid are displaced by `shifts` (T,) or (T, N)."""
     system, theta = prepared.system, prepared.theta
     points = window.points[:, None] if shifts is None else (window.points + shifts.reshape(len(times), -1))[..., None]
     if shifts is not None:
@@ -174,27 +179,27 @@ def coefficients(
         drift = np.broadcast_to(known.drift, (len(times), len(known.drift)))
         covariance = np.broadcast_to(known.covariance, (len(times), *np.shape(known.covariance)))
     if not inside.any():
-        return drift, covariance, np.zeros(drift.shape), np.zeros(len(times))
+        return Coefficients(drift, covariance, np.zeros(drift.shape), np.zeros(len(times)))
     if system.steady_observation and system.steady_noise and system.cross is None and shifts is None:
         h = tables(prepared, window).observation
         value, constant = potential_of(h, precision_of(prepared, times, inside), rates, values)
-        return drift, covariance, np.broadcast_to(value, (len(times), len(value))), np.full(len(times), constant)
+        return Coefficients(drift, covariance, np.broadcast_to(value, (len(times), len(value))), np.full(len(times), constant))
     if system.steady_observation and shifts is None:
         h = np.broadcast_to(tables(prepared, window).observation, (len(times), system.m, drift.shape[1]))
     else:
         h = np.moveaxis(system.observation(points, times[:, None], theta), -1, 1)
     precision = np.broadcast_to(precision_of(prepared, times, inside), (len(times), system.m, system.m))
     potentials, constants = zip(*[potential_of(*pair, rates, values) for pair in zip(h, precision, strict=True)], strict=True)
-    result = drift, covariance, np.stack(potentials), np.array(constants)
+    result = Coefficients(drift, covariance, np.stack(potentials), np.array(constants))
     return result if system.cross is None else with_cross_noise(prepared, points, times, rates, h, precision, result)
 
 
-def precision_of(prepared: Prepared, times: Any, inside: np.ndarray) -> Array:
+def precision_of(prepared: Prepared, times: Array | float, inside: np.ndarray) -> Array:
     """Return the inverse of the block of S of the coordinates that act inside, zero elsewhere, (..., m, m)."""
     system = prepared.system
     both = inside[:, None] & inside
 
-    def make(times: Any) -> Array:
+    def make(times: Array | float) -> Array:
         noise = system.noise(np.zeros((*np.shape(times), 1)), times, prepared.theta)
         return np.where(both, np.linalg.inv(np.where(both, noise, 0.0) + np.diag(1.0 * ~inside)), 0.0)
 
@@ -203,7 +208,7 @@ def precision_of(prepared: Prepared, times: Any, inside: np.ndarray) -> Array:
     return make(times)
 
 
-def potential_of(h: Array, precision: Array, rates: np.ndarray, values: Array) -> tuple[Array, Any]:
+def potential_of(h: Array, precision: Array, rates: np.ndarray, values: Array) -> tuple[Array, Number]:
     """Return h'S^-1 (dy/dt - h / 2) less its value at the maximum of the density (N,), and that value.
 
     Large numbers cancel before they are squared.  Where h has no value the potential is a large negative number.
@@ -213,7 +218,7 @@ def potential_of(h: Array, precision: Array, rates: np.ndarray, values: Array) -
     with np.errstate(all="ignore"):
         value = np.sum(finite(rest) * (weighted[:, None] - 0.5 * (precision @ finite(rest))), axis=0)
     value = np.where(np.isfinite(h.real).all(axis=0) & (value.real > -1e8), value, -1e8)
-    return value, centre @ (precision @ (rates - 0.5 * centre))
+    return value, np.dot(centre, precision @ (rates - 0.5 * centre))
 
 
 def offset_of(potential: Array, values: Array) -> tuple[float, float]:
@@ -225,9 +230,7 @@ def offset_of(potential: Array, values: Array) -> tuple[float, float]:
     return top, float(np.max(potential.real)) - top
 
 
-def resolved_parts(
-    prepared: Prepared, values: Array, window: lw.Window, interval: TimeInterval
-) -> Panels:
+def resolved_parts(prepared: Prepared, values: Array, window: lw.Points, interval: TimeInterval) -> Panels:
     """Return parts of the interval in each of which the coefficients are polynomials of time, nearly."""
     system, theta, (_, start, length, inside, _) = prepared.system, prepared.theta.real, interval
     check = lw.grid_check(values, window.closed)
@@ -259,24 +262,17 @@ def resolved_parts(
 
 
 def with_cross_noise(
-    prepared: Prepared,
-    points: Array,
-    times: Array,
-    rates: Array,
-    h: Array,
-    precision: Array,
-    coefficients: tuple[Array, Array, Array, Array],
-) -> tuple[Array, Array, Array, Array]:
+    prepared: Prepared, points: Array, times: Array, rates: Array, h: Array, precision: Array, coefficients: Coefficients
+) -> Coefficients:
     """Return the coefficients of the equation with correlated noise from those with independent noise.
 
     Args:
-        prepared: the system.
         points: the points (N, 1) or (T, N, 1).
         times: (T,).
         rates: dy/dt (m,).
         h: (T, m, N).
         precision: K (T, m, m), zero for coordinates that do not act inside of the interval.
-        coefficients: f (T, N), G (T,) or (T, N), the potential (T, N) and its constant (T,).
+        coefficients: those with independent noise.
     """
     drift, covariance, potential, constant = coefficients
     parts = prepared.system.cross(points, times[:, None], prepared.theta)  # type: ignore[misc]
@@ -286,7 +282,7 @@ def with_cross_noise(
     rest = covariance - np.sum(gain * cross, axis=1)
     rest = np.where(rest.real > 1e-13 * covariance.real, rest, 0.0)
     drift = drift - np.sum(gain * (finite(h) - rates[:, None] + 0.5 * slope), axis=1)
-    return drift, rest, potential - 0.5 * np.sum(gain * h_slope, axis=1), constant
+    return Coefficients(drift, rest, potential - 0.5 * np.sum(gain * h_slope, axis=1), constant)
 
 
 HIDDEN = 0.05  # share of the drift that interpolation between the points may miss: a wave has at least five points
@@ -341,3 +337,38 @@ def _hidden(prepared: Prepared, window: lw.Window, start: float) -> tuple[Array,
         return make()
     pair: tuple[Array, Array] = prepared.once(Derived.HIDDEN_DRIFT, window, make)
     return pair
+
+
+CONTRACTED = -2.0  # f' times the length of an interval, below which other grids hold a density that becomes much sharper
+
+
+def travel(prepared: Prepared, values: Array, window: lw.Window, start: float, length: float) -> float:
+    """Return by how many of its ranges the drift moves a density in an interval, zero where grids do not move with it.
+
+    They do not where noise moves the state as far, or the density becomes much sharper.
+    """
+    system = prepared.system
+    if window.closed or prepared.kinked or system.kinks is not None or system.cross is not None or system.reflecting:
+        return 0.0
+    check, (carried, growth) = lw.grid_check(values, False), displaced(prepared, values, window, start, length)
+    G = covariance_at(system, window.points[[check.first, check.last]], start, prepared.theta.real)
+    noise = float(np.sqrt(np.max(G.real) * length))
+    if growth < CONTRACTED or abs(carried) < noise:
+        return 0.0
+    return abs(carried) / (window.spacing * (check.last - check.first + 1) + 2.0 * REACH * noise)
+
+
+def speed_of(prepared: Prepared, values: Array, window: lw.Window, start: float, length: float) -> float:
+    """Return the speed with which a grid follows a density in a substep: a whole number of its spacings in that time."""
+    carried, _ = displaced(prepared, values, window, start, length)
+    return window.spacing * float(np.round(carried / window.spacing)) / length
+
+
+def displaced(prepared: Prepared, values: Array, window: lw.Window, start: float, length: float) -> tuple[float, float]:
+    """Return about how far the drift carries the mean of a density, by its linearisation there, and f' times the length."""
+    mean, variance = lw.moments(values, window)
+    x = window.origin + float(mean.real) + float(np.sqrt(variance.real)) * np.array([0.0, -0.1, 0.1])
+    here, below, above = finite(prepared.system.drift(x[:, None], start, prepared.theta.real)[:, 0]).tolist()
+    growth = length * (above - below) / (x[2] - x[1])
+    result = length * here * (np.expm1(min(growth, 3.0)) / growth if abs(growth) > 1e-8 else 1.0)
+    return (float(result), float(growth)) if np.isfinite(result) else (0.0, 0.0)

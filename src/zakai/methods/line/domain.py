@@ -24,7 +24,6 @@ At the limit of Feller, kappa = 1, that is no small number for any e.  Finite vo
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 import sympy as sp
@@ -38,10 +37,9 @@ from zakai.models.domain import Interval
 from zakai.models.kept import kept, once_for_a_model
 from zakai.models.model import Model
 from zakai.models.numeric import numpy_function
+from zakai.numerics.arrays import Array
 from zakai.numerics.line import window as lw
 from zakai.numerics.line.resolution import EDGE, SUPPORT, TRANSITION_SHARE
-
-Array = Any
 
 # attributes that a model computes from its formulas
 _DERIVED = ("text", "observation_law", "covariance", "features", "depends_on_time", "_kept")
@@ -80,10 +78,10 @@ def on_the_line(model: Model) -> Model:
 
     arranged = sp.expand if np.isinf(variable.upper - variable.lower) else sp.together
 
-    def transformed(formula: sp.Expr, factor: Any = 1, more: Any = 0) -> sp.Expr:
+    def transformed(formula: sp.Expr, factor: sp.Expr | int = 1, more: sp.Expr | int = 0) -> sp.Expr:
         return sp.powsimp(arranged(formula.subs(w, x) * factor + more))
 
-    def matrix(formulas: sp.MatrixBase, factor: Any = 1) -> sp.ImmutableMatrix:
+    def matrix(formulas: sp.MatrixBase, factor: sp.Expr | int = 1) -> sp.ImmutableMatrix:
         return sp.ImmutableMatrix(formulas.applyfunc(lambda entry: transformed(entry, factor)))
 
     ito = -model.covariance[0, 0].subs(w, x) * second / (2 * first**3)
@@ -102,9 +100,9 @@ def on_the_line(model: Model) -> Model:
     return other
 
 
-NEAR = 1e-9  # distance from an end other than zero, relative to it and to the length of the domain
+NEAR_END = 1e-9  # distance from an end other than zero, relative to it and to the length of the domain
 NEAR_ZERO = 1e-40  # distance from zero, near which numbers have no rounding of their own
-APART = 1e3  # ratio of the two distances that show a power
+RATIO_OF_DISTANCES = 1e3  # ratio of the two distances that show a power
 GROWS = 1.5  # ratio of values there that have no finite limit
 EXACT = 1e-5  # by which kappa may miss its limit
 
@@ -130,7 +128,7 @@ def check_ends(model: Model, theta: Array, inputs: Array | None) -> None:
         if not np.isfinite(end):
             continue
         scale = abs(end) if not interval.bounded else max(abs(end), interval.upper - interval.lower)
-        near = end + side * np.array([APART, 1.0]) * (NEAR_ZERO if end == 0 else NEAR * scale)
+        near = end + side * np.array([RATIO_OF_DISTANCES, 1.0]) * (NEAR_ZERO if end == 0 else NEAR_END * scale)
         d = np.abs(near - end)
         with np.errstate(all="ignore"):
             values = function(near[:, None], model.start, theta.real, None if u is None else u[:, None]).reshape(-1, 2, 2)
@@ -158,17 +156,10 @@ FAR_DISTANCES = np.array([10.0, 20.0])  # logarithms of distances at which coeff
 NOISE_GROWS = 0.1  # exponent of the noise below which it does not grow towards an end
 
 
-def lost(total: float) -> float:
-    """Return the probability that a transition of a density with the mass one lost, from the mass after it."""
-    return abs(total - 1.0)
-
-
 def ends_of_leak(prepared: Prepared, window: lw.Window, ends: Array, start: float, length: float) -> Array | None:
     """Return offsets (2,) beyond which there is no density after an interval, None where a grid loses no more than is allowed.
 
     Args:
-        prepared: the system.
-        window: the grid.
         ends: the ends of the density as offsets from the origin (2,).
         start, length: the interval.
     """

@@ -14,12 +14,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from zakai.densities import Density, GridDensity, MappedDensity
-from zakai.methods._protocol import Info, Infos
+from zakai.methods._protocol import Info, Infos, joined, stacked
 from zakai.methods._states import Joined
 from zakai.methods.line import loop
 from zakai.methods.line.choice import predicted
@@ -40,17 +40,15 @@ from zakai.methods.line.update import (
     sampled_weakly,
     spread,
     state_moments,
-    state_of,
 )
 from zakai.methods.line.update import init as init
 from zakai.models.model import Model
+from zakai.numerics.arrays import Array, Number
 from zakai.numerics.line import window as lw
 from zakai.numerics.line.density import separated
-from zakai.numerics.line.product import General, multiplied
+from zakai.numerics.line.product import General, Likelihood, Product, multiplied
 from zakai.numerics.line.resolution import noise_bound
 from zakai.records.schedule import Schedule
-
-Array = Any
 
 SLOW = 1e-2  # of the tolerance: the spectrum that need not be resolved where f has kinks
 SLOW_GENEROUS = 256  # points of a grid that is retained though fewer would do
@@ -151,19 +149,15 @@ def segment_of_whole(
             with np.errstate(all="ignore"):
                 filtered = single(prepared, k, state, observed[k - rows.start])
             states.append([filtered.state])
-            parts.append(alone(filtered.info))
+            parts.append(stacked([filtered.info]))
         if noted is not None:
             noted(k, before, filtered)
         k, state = rows.start + len(states), states[-1]
-    return states, loop.joined(parts)
-
-
-def alone(info: Info) -> Infos:
-    health = {name: np.array([value]) for name, value in info.health.items()}
-    return Infos(np.array([info.log_likelihood_increment]), info.mean[None], info.cov[None], health)
+    return states, joined(parts)
 
 
 def single(prepared: Prepared, k: int, state: State, observed: np.ndarray) -> SingleStep:
+    """Return the step over interval k by the first mechanism that is accurate, and the observation at its stop."""
     schedule, length = prepared.schedule, float(prepared.lengths[k])
     values, window, report, check = np.asarray(state.values), state.window, Report(), None
     check_escape(prepared, k, window.points, values)
@@ -173,14 +167,17 @@ def single(prepared: Prepared, k: int, state: State, observed: np.ndarray) -> Si
         state, info = _of_parts(parts, 0, state, observed)
         return SingleStep(state, info, (), np.asarray(state.values), state.window, parts)
     transitions: tuple[RecordedTransition, ...] = ()
-    before, gained, contraction = lw.moments(values, window), 0.0, 1.0
+    _, before = lw.moments(values, window)  # the variance
+    contraction = 1.0
+    gained: Number = 0.0
     if length > 0:
         prediction, contraction = predicted(prepared, values, window, prepared.interval(k, inside, observed), report)
         values, window, gained, check, transitions = prediction
-    mean_and_variance, log_floor = lw.moments(values, window), float(state.log_floor)
+    _, between = lw.moments(values, window)
+    log_floor = float(state.log_floor)
     if report.positive:
         # A positive kernel fills the tails again.
-        wider = mean_and_variance[1].real / max(contraction**2 * before[1].real, 1e-300)
+        wider = between.real / max(contraction**2 * before.real, 1e-300)
         log_floor = max(log_floor * float(np.clip(wider, 1.0, 20.0)), float(np.log(prepared.cut)))
         floor = float(np.exp(log_floor)) + report.edge
     else:
@@ -193,12 +190,7 @@ def single(prepared: Prepared, k: int, state: State, observed: np.ndarray) -> Si
         if prepared.weak and not np.iscomplexobj(values):
             product, check = sampled_weakly(prepared, k, values, window, observed)
         else:
-            product = multiplied(values, window, likelihood, noise_bound(prepared.tolerance))
-            ends = lw.grid_check(product.values, product.window.closed)
-            if max(ends.left, ends.right) > PILED and product.depth > prepared.deepest(floor):
-                # No state within reach explains the observation: it counts in the evidence alone.
-                product = product._replace(values=values, window=window, depth=np.inf)
-            check = grid_check(prepared, product.values, product.window)
+            product, check = _multiplied(prepared, values, window, likelihood, prepared.deepest(floor))
         values, window, gained = product.values, product.window, gained + product.log_mass
         report.depth, report.growth = product.depth, product.growth
         report.density(check)
@@ -211,18 +203,28 @@ def single(prepared: Prepared, k: int, state: State, observed: np.ndarray) -> Si
         report.aliasing = max(report.aliasing, coarse)
     mean, variance = lw.moments(values, window)
     report.edge = max(report.edge, edge_of_moments(prepared, values, window))
-    retained = error_remainder(before[1], mean_and_variance[1], variance, spread(prepared, k, length, window.origin + mean.real))
+    retained = error_remainder(before, between, variance, spread(prepared, k, length, window.origin + mean.real))
     error_before = state.error * (1.0 if separated(np.ascontiguousarray(values.real)) else retained)
     spacings = float(np.sqrt(max(variance.real, 0.0))) / window.spacing
     error, health = report.figures(prepared, floor, error_before, spacings)
     if prepared.system.tabulated:
         health["outside_tables"] = outside_tables(prepared, values, window, float(schedule.stops[k]))
     mean, variance = state_moments(prepared, values, window, mean, variance)
-    if window.closed:
-        mean = mean - 2 * np.pi * np.ceil((mean.real - np.pi) / (2 * np.pi))
     log_floor = min(log_floor + max(report.depth - 1.0, 0.0), 0.0)
     info = Info(gained, np.array([mean]), np.array([[variance]]), health)
-    return SingleStep(state_of(new_values, new, error, log_floor), info, transitions, values, window)
+    return SingleStep(State.of(new_values, new, error, log_floor), info, transitions, values, window)
+
+
+def _multiplied(
+    prepared: Prepared, values: Array, window: lw.Window, likelihood: Likelihood, deepest: float
+) -> tuple[Product, lw.GridCheck]:
+    """Return the product with a likelihood and its check; the prediction where it lies `deepest` in the tails and at an end."""
+    product = multiplied(values, window, likelihood, noise_bound(prepared.tolerance))
+    ends = lw.grid_check(product.values, product.window.closed)
+    if max(ends.left, ends.right) > PILED and product.depth > deepest:
+        # No state within reach explains the observation: it counts in the evidence alone.
+        product = product._replace(values=values, window=window, depth=np.inf)
+    return product, grid_check(prepared, product.values, product.window)
 
 
 def valid(prepared: Prepared, state: State) -> bool:

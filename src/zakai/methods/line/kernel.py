@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
 from zakai.methods.line.prepared import Prepared, TimeInterval
 from zakai.methods.line.report import Report
 from zakai.methods.line.transition import Prediction
+from zakai.numerics.arrays import Array
 from zakai.numerics.line import window as lw
 from zakai.numerics.line.gaussian_kernels import WIDE, Channel, applied, around, chosen, wrapped
 from zakai.numerics.line.resolution import noise_bound
 
-Array = Any
-
-NARROWEST = 1.4  # spacings that the standard deviation of a kernel must have
+NARROWEST_KERNEL = 1.4  # spacings that the standard deviation of a kernel must have
 MOST_GRIDS = 13
 
 
@@ -25,9 +22,7 @@ def by_kernel(
     """Return the density after an interval, None where its kernel is too narrow for the grid or no grid fits.
 
     Args:
-        prepared: the system.
         values, window: the density (N,) and its grid.
-        interval: the interval.
         kernel: that of the interval, for x relative to the origin of `window`.
         report: receives the figures of the density.
     """
@@ -42,7 +37,7 @@ def _around(prepared: Prepared, values: Array, window: lw.Window, kernel: Channe
     """Return a density on the circle convolved with a wrapped Gaussian, None where the kernel is none or too narrow."""
     if np.iscomplexobj(values) or np.iscomplexobj(kernel.variance) or np.iscomplexobj(kernel.shift):
         return None
-    variance = kernel.variance / window.spacing**2
+    variance = kernel.variance.real / window.spacing**2
     if kernel.scale != 1.0 or kernel.slope != 0.0 or kernel.curvature != 0.0 or not variance >= WIDE:
         return None
     result = np.array(values, float)
@@ -57,7 +52,7 @@ def _along(
     """Return a density on the line after an interval."""
     yau, theta, cut, negligible = prepared.yau, prepared.theta, prepared.cut, prepared.negligible
     width, rough = np.sqrt(np.abs(kernel.variance.real)), noise_bound(prepared.tolerance)
-    if yau is None or not width > NARROWEST * window.spacing * abs(kernel.scale.real):
+    if yau is None or not width > NARROWEST_KERNEL * window.spacing * abs(kernel.scale.real):
         return None
     sources = window.offsets
     logs = np.log(np.where(values.real > 0, values, 0.0)) - yau.potential(window.points, start, theta)

@@ -1,4 +1,4 @@
-"""Many steps of one-state filters in one compiled loop (`numerics/line/loop.py`, `numerics/line/modes.py`).
+"""Many steps of one-state filters in one compiled loop (`numerics/line/loop.py`, `numerics/line/modes_loop.py`).
 
 An interval that the loop refuses (an error above the tolerance, a gap in a path) is filtered by `single` of `line/filter.py`.
 `step` of that file asks this loop for its one interval first: whether steps are taken one by one or together makes no difference.
@@ -11,35 +11,22 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zakai.methods._protocol import Info, Infos
+from zakai.methods._protocol import Info, Infos, joined
 from zakai.methods._states import Joined, StackedStates
 from zakai.methods.line import modal
 from zakai.methods.line.cache import Derived
 from zakai.methods.line.coefficients import misses_drift, on_grid_for_drift
 from zakai.methods.line.prepared import Prepared, State
 from zakai.methods.line.update import edge_of_moments, grid_check, on_fitting_grid, outside_tables, resampled, state_moments
+from zakai.numerics.arrays import Array
 from zakai.numerics.line import window as lw
 from zakai.numerics.line.averages import GAUSS_NODES, parts_needed, probed
 from zakai.numerics.line.gaussian_kernels import BAND
 from zakai.numerics.line.loop import advance
-from zakai.numerics.line.modes import OWN, PLACE, STAY
+from zakai.numerics.line.modes_loop import OWN, PLACE, STAY
 from zakai.numerics.line.product import at_nodes, nodes
 from zakai.numerics.line.resolution import TRIALS
-from zakai.numerics.line.steps import (
-    CELL,
-    COLUMNS,
-    DRIFT,
-    MARGIN,
-    OBSERVED,
-    PHI,
-    SLOPE,
-    Grid,
-    Segment,
-    Start,
-    Status,
-)
-
-Array = Any
+from zakai.numerics.line.steps import CELL, COLUMNS, DRIFT, OBSERVED, PHI, SLOPE, TABLE_MARGIN, Grid, Segment, Start, Status
 
 BLOCK = 2048  # points by which the tables of a spacing are apart; a table has twice as many
 LOBATTO = np.array([0.0, 0.5 - 0.5 / np.sqrt(5.0), 0.5 + 0.5 / np.sqrt(5.0)])  # nodes within a spacing
@@ -52,7 +39,7 @@ def grid_of(prepared: Prepared, window: lw.Window, rows: slice) -> Grid | None:
     if window.closed:
         begin, length = 0, size
     elif prepared.mixed:
-        begin, length = index - size // 2 - MARGIN, size + 2 * MARGIN
+        begin, length = index - size // 2 - TABLE_MARGIN, size + 2 * TABLE_MARGIN
     else:
         begin, length = BLOCK * round(index / BLOCK) - BLOCK, 2 * BLOCK
     start = 0 if window.closed else index - size // 2 - begin
@@ -138,7 +125,7 @@ def _mixed(prepared: Prepared, window: lw.Window, x: np.ndarray, rows: slice) ->
 
 
 LARGER = 0.2  # margin of a new grid, relative to the range of the density
-TOGETHER = 32  # intervals whose tables of coefficients in time are computed together
+INTERVALS_TOGETHER = 32  # intervals whose tables of coefficients in time are computed together
 HEALTH = {
     "edge_mass": "edge",
     "negative_mass": "negative",
@@ -184,7 +171,7 @@ class Piece(NamedTuple):
         """Return steps after which the grid stays."""
         error, log_floor = float(reports[-1, ERROR]), float(reports[-1, FLOOR])
         centre, spacing = float(centres[-1]), float(spacings[-1])
-        last = State(densities[-1], before.origin, centre, spacing, before.unit, before.closed, error, log_floor)
+        last = before._replace(values=densities[-1], centre=centre, spacing=spacing, error=error, log_floor=log_floor)
         return cls(first, before, densities, centres, spacings, reports, last)
 
 
@@ -249,7 +236,7 @@ def _on_one_table(
     prepared: Prepared, rows: slice, state: State, window: lw.Window, observed: np.ndarray
 ) -> tuple[Piece | None, Status, Array]:
     """Return the first steps of `rows` by kernels or splitting, why they end, and the grid that is needed."""
-    together = 1 if prepared.cut_up else TOGETHER if prepared.mixed else len(observed)
+    together = 1 if prepared.cut_up else INTERVALS_TOGETHER if prepared.mixed else len(observed)
     here = slice(rows.start, min(rows.stop, rows.start + together))
     grid = grid_of(prepared, window, here)
     if grid is None:
@@ -264,13 +251,6 @@ def _piece(first: int, before: State, start: int, segment: Segment) -> Piece:
     spacing = before.spacing
     centres = spacing * (round(before.centre / spacing) + (segment.reports[:, START] - start))
     return Piece.of(first, before, segment.densities, centres, np.full(len(centres), spacing), segment.reports)
-
-
-def joined(parts: list[Infos]) -> Infos:
-    """Return the reports of consecutive steps as one."""
-    health = {name: np.concatenate([part.health[name] for part in parts]) for name in parts[0].health}
-    increments, means, covs = (np.concatenate([part[i] for part in parts]) for i in range(3))
-    return Infos(increments, means, covs, health)
 
 
 def _covering(prepared: Prepared, state: State, low: float, high: float, spacing: float) -> State | None:

@@ -7,25 +7,24 @@ towards the ends of the grid: its operator is that of a density, with the drift 
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from zakai.methods.line.cache import Derived
 from zakai.methods.line.coefficients import decomposed
 from zakai.methods.line.prepared import Prepared, State
+from zakai.numerics.arrays import Array
 from zakai.numerics.line import window as lw
 from zakai.numerics.line.backward import FEWEST
 from zakai.numerics.line.operator import Spectral
 from zakai.numerics.line.window import local_polynomial
 
-Array = Any
-
 FALL = 3.3  # spacings over which F falls
 HALF = 14.0  # spacings from where F is one to where it is one half
 PAD = 28  # spacings over which F falls to zero
-FEW = 16  # larger grids have a multiple of so many points: few different sizes
-SURE = 10.0  # errors of a density from which its small values count
+SIZE_STEP = 16  # larger grids have a multiple of so many points: few different sizes
+SURE_OF_DENSITY = 10.0  # errors of a density from which its small values count
 LOWEST = -30.0  # logarithm of the largest error of small values, relative to the largest value
 
 
@@ -74,7 +73,7 @@ class Message(NamedTuple):
         """Return log b at offsets from the origin (J,), beyond the grid with the slope at its ends where b falls outward."""
         result = self.at(offsets)
         (low, high), (left, right) = self.ends, np.maximum(self.logs[[3, -4]] - self.logs[[0, -1]], 0.0) / (3.0 * self.spacing)
-        return result - left * np.maximum(low - offsets, 0.0) - right * np.maximum(offsets - high, 0.0)
+        return np.asarray(result - left * np.maximum(low - offsets, 0.0) - right * np.maximum(offsets - high, 0.0))
 
     def between(self, low: float, high: float) -> Message:
         """Return the message on its points between two offsets, and on those that hold them."""
@@ -108,7 +107,7 @@ def taper(offsets: Array, ends: tuple[float, float], spacing: float) -> Array:
     from scipy.special import erfc
 
     beyond = np.maximum(ends[0] - offsets, offsets - ends[1]) / spacing
-    return 0.5 * erfc((beyond - HALF) / FALL)
+    return np.asarray(0.5 * erfc((beyond - HALF) / FALL))
 
 
 def covering(window: lw.Window, low: float, high: float, spacing: float) -> lw.Window:
@@ -131,14 +130,14 @@ def points_of(window: lw.Window, low: float, high: float, spacing: float) -> lw.
     spacing = lw.quantized(window, low, high, spacing).spacing
     first, last = np.floor(low / spacing + 1e-9), np.ceil(high / spacing - 1e-9)
     size = max(int(last - first) + 1, FEWEST)
-    size = size if size < 4 * FEW else FEW * -(-size // FEW)
+    size = size if size < 4 * SIZE_STEP else SIZE_STEP * -(-size // SIZE_STEP)
     return window._replace(centre=float((first + size // 2) * spacing), spacing=spacing, size=size)
 
 
 def reliable(state: State, window: lw.Window) -> Array:
     """Return the density on another grid, zero where its error is as large."""
     values = np.asarray(state.values).real
-    floor = SURE * float(np.exp(min(state.log_floor, LOWEST))) * float(np.max(values))
+    floor = SURE_OF_DENSITY * float(np.exp(min(state.log_floor, LOWEST))) * float(np.max(values))
     return lw.resampled(np.where(values > floor, values, 0.0), state.window, window)
 
 

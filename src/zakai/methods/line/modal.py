@@ -1,4 +1,4 @@
-"""Steps by the modes of the operator (`numerics/line/modes.py`), for `line/loop.py`, and by those of a coarse grid.
+"""Steps by the modes of the operator (`numerics/line/modes_loop.py`), for `line/loop.py`, and by those of a coarse grid.
 
 After an interval tau no wave shorter than the standard deviation of the noise is left, (tau G)^(1/2) where the drift does not
 contract it.  The modes of the operator on a coarse grid that resolves this deviation carry the density,
@@ -13,7 +13,7 @@ filtered alone: with kinks or jumps of a likelihood, and for complex densities.
 from __future__ import annotations
 
 from threading import Lock
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -21,19 +21,19 @@ from zakai.methods.line.cache import CacheKey, Derived
 from zakai.methods.line.coefficients import covariance_at, gauge_at, profile_of, spectral
 from zakai.methods.line.prepared import SHARED, Prepared, State
 from zakai.methods.line.update import factor_at_end, grid_check
-from zakai.numerics.line import modes as lm
+from zakai.numerics.arrays import Array
+from zakai.numerics.line import modes_loop as lm
 from zakai.numerics.line import window as lw
 from zakai.numerics.line.density import circular_rows, waves
 from zakai.numerics.line.grid_choice import PER, SPACING, WIDENING, coarse_grid
+from zakai.numerics.line.modes import KnownGrids, Start
 from zakai.numerics.line.product import General, at_nodes, nodes, weaken
 from zakai.numerics.line.resolution import TRIALS, edge_bound, rounding_bound, spectrum_bound
 from zakai.numerics.line.steps import COLUMNS, STATUSES, Status
 
-Array = Any
-
-TOGETHER = 8  # intervals whose likelihoods are computed together
+ROWS_TOGETHER = 8  # intervals whose likelihoods are computed together
 NEW = 12  # coarse grids and rows that are made for one step
-SIZES = (80, 160, 384, 1024)  # points of fine grids
+FINE_SIZES = (80, 160, 384, 1024)  # points of fine grids
 NUMBERS = 2**21  # of the grids that are known together
 
 
@@ -81,24 +81,23 @@ def advanced(prepared: Prepared, k: int, stop: int, state: State, observed: np.n
     Args:
         prepared: a system with samples whose operator has a decomposition.
         k, stop: the intervals.
-        state: the state before them.
         observed: what is observed (K, m).
-        placement: whether the steps stay on the grid of the state, see `numerics/line/modes.py`.
+        placement: whether the steps stay on the grid of the state, see `numerics/line/modes_loop.py`.
     """
     system, window, steps, stays = prepared.system, state.window, prepared.steps, placement == lm.STAY
     general, special = system.general or prepared.weak, system.general or not system.steady_observation or prepared.weak
     key, profile = (window.origin, window.unit, window.closed), profile_of(prepared, window)
     coarse, rows, at = prepared.once(Derived.COARSE_GRIDS, key, Coarse), np.empty((0, 0, 0)), 0
-    start = lm.Start(np.ascontiguousarray(state.values), float(state.centre), float(state.spacing), float(state.error))
+    start = Start(np.ascontiguousarray(state.values), float(state.centre), float(state.spacing), float(state.error))
     frame = lm.Frame(window.unit, window.closed, profile)
-    owner, count = (-2, stop - k) if not special else (-1, min(TOGETHER, stop - k) if stays else 1)
+    owner, count = (-2, stop - k) if not special else (-1, min(ROWS_TOGETHER, stop - k) if stays else 1)
     for _ in range(NEW):
-        n = window.size if stays else SIZES[at]
+        n = window.size if stays else FINE_SIZES[at]
         cosines, sines = waves(n)
         densities, places, out = np.empty((count, n)), np.empty((count + 1, 4)), np.zeros((count, len(COLUMNS)))
         samples = lm.Samples(k, observed[:count], steps.lengths, steps.precisions[:, 0], steps.constants)
         done, number = lm.advance(
-            start, frame, lm.KnownGrids(coarse.numbers, coarse.index), lm.Special(rows, owner, general), placement, samples,
+            start, frame, KnownGrids(coarse.numbers, coarse.index), lm.Special(rows, owner, general), placement, samples,
             prepared.limits, lm.Results(cosines, sines, densities, places, out),
         )  # fmt: skip
         if window.closed:
@@ -111,7 +110,7 @@ def advanced(prepared: Prepared, k: int, stop: int, state: State, observed: np.n
             return result
         if result.status == Status.SIZE:
             at, count = at + 1, 1
-            if at < len(SIZES):
+            if at < len(FINE_SIZES):
                 continue
         else:
             centre, spacing, size = result.answer.tolist()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from copy import copy
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import sympy as sp
@@ -16,9 +16,9 @@ from zakai.models.functions import Floor, Maximum, Minimum, TableFunction
 from zakai.models.kept import once_for_a_model
 from zakai.models.model import Model
 from zakai.models.numeric import numpy_function
+from zakai.numerics.arrays import Array
 from zakai.records.inputs import Inputs
 
-Array = Any
 Function = Callable[..., Array]
 
 _JUMPS = (sp.sign, sp.Heaviside, Floor, sp.atan2)

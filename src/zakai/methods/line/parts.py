@@ -29,9 +29,7 @@ def cut(parts: Parts, rows: slice, observed: np.ndarray) -> tuple[slice, np.ndar
     return inner, np.where(prepared.schedule.seen[inner], values, 0.0), first[1:] - first[0] - 1
 
 
-def segment_of_parts(
-    parts: Parts, rows: slice, state: State, observed: np.ndarray, run: Segment
-) -> tuple[list[State], Infos]:
+def segment_of_parts(parts: Parts, rows: slice, state: State, observed: np.ndarray, run: Segment) -> tuple[list[State], Infos]:
     """Return the states after the intervals of a slice, and their reports, by `run` for the parts."""
     inner, values, last = cut(parts, rows, observed)
     states, infos = run(parts.prepared, inner, state, values)

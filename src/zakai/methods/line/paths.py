@@ -23,14 +23,14 @@ from zakai.densities._values import wrap
 from zakai.methods.line import filter as line_filter
 from zakai.methods.line.domain import variable_of
 from zakai.methods.line.prepared import Prepared, State
+from zakai.numerics.arrays import Array
 from zakai.numerics.complex_step import STEP
 from zakai.numerics.line import window as lw
 from zakai.numerics.line.window import local_polynomial
-from zakai.numerics.transition import Array
 
-RELIABLE = 1e-10  # of the maximum: a density whose derivative is not rounding
-NARROW = 0.02  # ratio of deviations below which skewness and kurtosis are zero but for rounding
-WIDE = 0.5  # conditional deviation of an angle for which two waves do not suffice
+RELIABLE_DENSITY = 1e-10  # of the maximum: a density whose derivative is not rounding
+NARROW_LAW = 0.02  # ratio of deviations below which skewness and kurtosis are zero but for rounding
+WIDEST_ANGLE = 0.5  # conditional deviation of an angle for which two waves do not suffice
 
 
 class Law(NamedTuple):
@@ -43,21 +43,21 @@ class Law(NamedTuple):
 
 
 @np.errstate(all="ignore")
-def draw(prepared: Prepared, k: int, later: Array, values: Array, state: State, rng: np.random.Generator) -> tuple[Array, float]:
+def draw(prepared: Prepared, k: int, draws: Array, values: Array, state: State, rng: np.random.Generator) -> tuple[Array, float]:
     """Return draws (P, 1) of the state at the start of interval k given those at its end, and how far the law is from normal.
 
     The second is the root mean square of skewness and kurtosis, which falls with the length of the interval.
     """
     if prepared.lengths[k] == 0:
-        return later, 0.0
+        return draws, 0.0
     variable = variable_of(prepared.model)
-    z = (later if variable is None else variable.w(later))[:, 0]
+    z = (draws if variable is None else variable.w(draws))[:, 0]
     law, window, ends = _law(prepared, k, values, state)
     offsets = z - window.origin
     offsets = window.centre + wrap(offsets - window.centre) if window.closed else np.clip(offsets, *ends)
     shift, deviation, skewness, kurtosis = (local_polynomial(part, window, offsets) for part in law)
     departure = float(np.sqrt(np.mean(skewness**2 + kurtosis**2)))
-    if not np.isfinite(departure) or (window.closed and np.max(deviation) > WIDE):
+    if not np.isfinite(departure) or (window.closed and np.max(deviation) > WIDEST_ANGLE):
         departure = np.inf
     e = rng.standard_normal(len(z))
     skewness, kurtosis = np.clip(skewness, -1.0, 1.0), np.clip(kurtosis, -1.0, 2.0)
@@ -80,14 +80,14 @@ def _law(prepared: Prepared, k: int, values: Array, state: State) -> tuple[Law, 
         ratio = propagated.values.imag / propagated.values.real
         means.append((ratio + np.imag(info.log_likelihood_increment)) / STEP)
     window, q = propagated.window, propagated.values.real
-    reliable = np.flatnonzero(q > RELIABLE * np.max(q))
+    reliable = np.flatnonzero(q > RELIABLE_DENSITY * np.max(q))
     ends = float(window.offsets[reliable[0]]), float(window.offsets[reliable[-1]])
     if own.closed:
         return _of_waves(means[0] + 1j * means[1], means[2] + 1j * means[3], window), window, ends
     first, second, third, fourth = means
     spread = np.maximum(second - first**2, 1e-300)
     deviation = np.sqrt(spread)
-    narrow = deviation < NARROW
+    narrow = deviation < NARROW_LAW
     skewness = (third - 3 * first * second + 2 * first**3) / deviation**3
     kurtosis = (fourth - 4 * first * third + 6 * first**2 * second - 3 * first**4) / spread**2 - 3.0
     shift = mean + scale * first - window.offsets
@@ -102,6 +102,6 @@ def _of_waves(first: Array, second: Array, window: lw.Window) -> Law:
     fourth = 2.0 * (two - 4.0 * one)
     spread = np.maximum(-2.0 * one + fourth / 12.0, 1e-300)
     deviation = np.sqrt(spread)
-    narrow = deviation < NARROW
+    narrow = deviation < NARROW_LAW
     skewness, kurtosis = -np.angle(turned) / deviation**3, fourth / spread**2
     return Law(wrap(direction - window.points), deviation, np.where(narrow, 0, skewness), np.where(narrow, 0, kurtosis))

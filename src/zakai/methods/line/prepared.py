@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
@@ -21,6 +21,7 @@ from zakai.methods.system.notes import OMITTED
 from zakai.methods.yau.kernel import PowerSeries
 from zakai.models.model import Model
 from zakai.models.prior import GaussianPrior
+from zakai.numerics.arrays import Array
 from zakai.numerics.complex_step import log_determinant
 from zakai.numerics.line import window as lw
 from zakai.numerics.line.averages import GAUSS_NODES, parts_needed, probed
@@ -29,7 +30,7 @@ from zakai.numerics.line.resolution import GROSS
 from zakai.numerics.line.steps import FACTOR, KERNEL, SPLIT, SPLIT_FACTOR, Limits, Mechanisms, Steps
 from zakai.records.schedule import Schedule, lengths_of
 
-Array = Any
+T = TypeVar("T")
 
 NOISE = 3e-15  # error of a density relative to its maximum, which matters in its tails
 KERNEL_SHARE = 2e-2  # of the promised error that the splitting of one interval may leave in `limited-direct`
@@ -52,6 +53,11 @@ class State(NamedTuple):
     error: float
     log_floor: float
 
+    @classmethod
+    def of(cls, values: Array, window: lw.Window, error: float, log_floor: float) -> State:
+        """Return the state of probabilities on a grid."""
+        return cls(values, window.origin, window.centre, window.spacing, window.unit, window.closed, error, log_floor)
+
     @property
     def window(self) -> lw.Window:
         """The grid."""
@@ -60,7 +66,7 @@ class State(NamedTuple):
         )
 
 
-class Coefficients(NamedTuple):
+class CoefficientsInTime(NamedTuple):
     """What the compiled loop knows of the coefficients in time of K intervals: see `steps.Steps`.
 
     `parts` (K,) are in how many parts of an interval the Gauss nodes would resolve them, 0 for never.
@@ -240,7 +246,7 @@ class Prepared:
         return 1e-32 if self.system.samples else lw.DEEP
 
     @cached_property
-    def coefficients(self) -> Coefficients:
+    def coefficients(self) -> CoefficientsInTime:
         """The coefficients in time of all intervals."""
         return coefficients_of(self)
 
@@ -303,19 +309,20 @@ class Prepared:
         """Return the depth of the tails, as a logarithm below the maximum, to which a density with this floor is accurate."""
         return max(float(np.log(self.promised) - np.log(max(floor, 1e-300))), 2.3)
 
-    def once(self, quantity: Derived, at: Hashable, make: Callable[[], Any]) -> Any:
+    def once(self, quantity: Derived, at: Hashable, make: Callable[[], T]) -> T:
         """Return the derived quantity of a grid, or of what else it is `at`, by `make` where the cache does not hold it.
 
         A value depends on its key alone.
         """
         key = CacheKey(quantity, at)
-        result = self.grid_cache.pop(key, None)
-        if result is None:
+        entry = self.grid_cache.pop(key, None)
+        if entry is None:
             value = make()
             self.grid_cache.insert(key, value)
             return value
-        self.grid_cache[key] = result  # the last one that was used is the last one to go
-        return result[0]
+        self.grid_cache[key] = entry  # the last one that was used is the last one to go
+        value = entry[0]
+        return value
 
 
 # What of a `Prepared` does not depend on its schedule: what is computed, and with it the fields.
@@ -323,7 +330,7 @@ STEADY = ("divides", "gaussian", "timed", "weak", "mixed", "cut", "limits")
 FIELDS = (*(field.name for field in fields(Prepared)), *STEADY)
 
 
-def coefficients_of(prepared: Prepared, steady: Coefficients | None = None) -> Coefficients:
+def coefficients_of(prepared: Prepared, steady: CoefficientsInTime | None = None) -> CoefficientsInTime:
     """Return what the loop needs of the coefficients in time of all intervals; of one, `steady` has those that are constant."""
     schedule, system, theta = prepared.schedule, prepared.system, prepared.theta
     count, seen, m = len(schedule), schedule.seen, system.m
@@ -384,7 +391,7 @@ def coefficients_of(prepared: Prepared, steady: Coefficients | None = None) -> C
         if not (system.samples or system.steady_noise):
             parts = np.maximum(parts, parts_needed(precision(noise[:, probes])[0], precisions))
     drifts, outputs = (np.array(factors[:, part], order="C") for part in (own, ends))
-    return Coefficients(drifts, outputs, covariances, precisions, constants, parts)
+    return CoefficientsInTime(drifts, outputs, covariances, precisions, constants, parts)
 
 
 _X = np.zeros(1)
@@ -479,8 +486,8 @@ def parts_of(prepared: Prepared) -> Parts | None:
     return Parts(result.over(result.schedule, shares), first)
 
 
-def _bounds(prepared: Prepared, k: int, count: int) -> list[Any]:
+def _bounds(prepared: Prepared, k: int, count: int) -> list[float]:
     """Return where the parts of an interval begin: where inputs have a jump or a kink, else in equal steps."""
     start, stop = float(prepared.schedule.starts[k]), float(prepared.schedule.stops[k])
     pieces = [first for first, _ in prepared.system.pieces(start, stop)]
-    return pieces if len(pieces) > 1 else list(start + (stop - start) / count * np.arange(count))
+    return pieces if len(pieces) > 1 else (start + (stop - start) / count * np.arange(count)).tolist()

@@ -25,7 +25,6 @@ class Report:
         """Return the error estimate after a step and its health figures.
 
         Args:
-            prepared: the system.
             floor: the error of small values of the prediction, relative to the maximum.
             before: the remainder of the error before the step.
             spacings: the standard deviation of the density, in spacings.

@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Any
 
 import numpy as np
 from sympy import sympify
@@ -24,13 +23,12 @@ from zakai.methods.line.parts import segment_of_parts
 from zakai.methods.line.prepared import Parts, Prepared, State
 from zakai.methods.line.transition import RecordedTransition, Substep, exponents_of
 from zakai.methods.line.update import factor_of
+from zakai.numerics.arrays import Array, Number
 from zakai.numerics.complex_step import STEP
 from zakai.numerics.line import window as lw
 from zakai.numerics.line.splitting import Interval, TangentCoefficients, through
 from zakai.numerics.line.steps import SPLIT
 from zakai.numerics.line.tangents import Varied, exponential_tangents, extended, resampled_tangents
-
-Array = Any
 
 IN_TIME = "drifts", "outputs", "covariances", "precisions"
 
@@ -41,10 +39,7 @@ def tangents(
     """Return what `line_filter.segment` returns, with derivatives; None where likelihoods act in the weak sense.
 
     Args:
-        prepared: what is known without data.
         shifted: the same at parameters of which the i-th has an infinitesimal imaginary part, for i < p.
-        rows: the intervals.
-        state: the state before them.
         shifted_states: the same at the p parameters.
         observed: what is observed (K, m).
     """
@@ -181,7 +176,8 @@ class _Walk:
 
     def _passed(self, prepared: Prepared, k: int, before: State, step: line_filter.SingleStep, observed: np.ndarray) -> None:
         """Take a single step whose transitions are known."""
-        density, own, gained = before.values, before.window, 0.0
+        density, own = before.values, before.window
+        gained: Number = 0.0
         for transition in step.transitions:
             self._regrid(density, own, transition.window)
             own = transition.after

@@ -12,36 +12,36 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from zakai.methods.line.cache import Derived
 from zakai.methods.line.coefficients import (
     GROWTH,
+    Coefficients,
     coefficients,
-    covariance_at,
     offset_of,
     on_grid_for_drift,
     potential_of,
     precision_of,
     resolved_parts,
     spectral,
+    speed_of,
     tables,
 )
-from zakai.methods.line.domain import lost
 from zakai.methods.line.modal import coarsened
-from zakai.methods.line.model import finite
 from zakai.methods.line.prepared import NOISE, Prepared, TimeInterval
 from zakai.methods.line.report import Report
 from zakai.methods.line.update import refitted
+from zakai.numerics.arrays import Array, Number
 from zakai.numerics.line import window as lw
 from zakai.numerics.line.averages import GAUSS_NODES, GAUSS_WEIGHTS
-from zakai.numerics.line.grid_choice import REACH
-from zakai.numerics.line.operator import FourierOperator, exponential_of
+from zakai.numerics.line.operator import FourierOperator, Generator, exponential_of
 from zakai.numerics.line.product import finer
 from zakai.numerics.line.resolution import (
     GROSS,
+    LOST_ALIASING,
     LOST_MASS,
     SPECTRUM_FACTOR,
     TRANSITION_SHARE,
@@ -51,47 +51,7 @@ from zakai.numerics.line.resolution import (
     spectrum_bound,
 )
 
-Array = Any
-
-CONTRACTED = -2.0  # f' times the length of an interval, below which other grids hold a density that becomes much sharper
-MOVING = 0.3  # ranges of a density that it moves in an interval without modes, above which grids move with it
-
-
-def travel(prepared: Prepared, values: Array, window: lw.Window, start: float, length: float) -> float:
-    """Return by how many of its ranges the drift moves a density in an interval, zero where grids do not move with it.
-
-    They do not where noise moves the state as far, or the density becomes much sharper.
-    """
-    system = prepared.system
-    if window.closed or prepared.kinked or system.kinks is not None or system.cross is not None or system.reflecting:
-        return 0.0
-    check, (carried, growth) = lw.grid_check(values, False), displaced(prepared, values, window, start, length)
-    G = covariance_at(system, window.points[[check.first, check.last]], start, prepared.theta.real)
-    noise = float(np.sqrt(np.max(G.real) * length))
-    if growth < CONTRACTED or abs(carried) < noise:
-        return 0.0
-    return abs(carried) / (window.spacing * (check.last - check.first + 1) + 2.0 * REACH * noise)
-
-
-def speed_of(prepared: Prepared, values: Array, window: lw.Window, start: float, length: float) -> float:
-    """Return the speed with which a grid follows a density in a substep: a whole number of its spacings in that time."""
-    carried, _ = displaced(prepared, values, window, start, length)
-    return window.spacing * float(np.round(carried / window.spacing)) / length
-
-
-def displaced(prepared: Prepared, values: Array, window: lw.Window, start: float, length: float) -> tuple[float, float]:
-    """Return about how far the drift carries the mean of a density, by its linearisation there, and f' times the length."""
-    mean, variance = lw.moments(values, window)
-    x = window.origin + float(mean.real) + float(np.sqrt(variance.real)) * np.array([0.0, -0.1, 0.1])
-    here, below, above = finite(prepared.system.drift(x[:, None], start, prepared.theta.real)[:, 0]).tolist()
-    growth = length * (above - below) / (x[2] - x[1])
-    result = length * here * (np.expm1(min(growth, 3.0)) / growth if abs(growth) > 1e-8 else 1.0)
-    return (float(result), float(growth)) if np.isfinite(result) else (0.0, 0.0)
-
-
-Coefficients = tuple[Array, Array, Array, Array]  # f (T, N), G (T,) or (T, N), V (T, N) and a constant (T,)
-
-PARTS = (1, 4, 16)  # of a substep with six nodes each, where the grid moves
+PARTS_OF_SUBSTEP = (1, 4, 16)  # of a substep with six nodes each, where the grid moves
 SMOOTHED = 100.0  # decay of the shortest wave of a large grid, as a logarithm, after which a coarser grid serves
 MAGNUS = 0.02  # of the tolerance that one substep of Magnus' series may leave
 
@@ -118,7 +78,7 @@ class Trial(NamedTuple):
     """
 
     values: Array
-    offset: Any
+    offset: Number
     error: float
     split: bool
     substep: Substep | None = None
@@ -128,9 +88,9 @@ class Trial(NamedTuple):
 class Exponents(NamedTuple):
     """The generators whose exponentials act in turn, each by its G, f and V, less an `offset` and a `constant` of V."""
 
-    generators: list[tuple[Any, Array, Array | None]]
+    generators: list[Generator]
     offset: float
-    constant: Any
+    constant: Number
     lift: float  # nats by which V is larger where there is no mass, infinite where G is negative
 
 
@@ -160,12 +120,12 @@ def exponents_of(prepared: Prepared, values: Array, window: lw.Window, substep: 
         return _of_magnus(prepared, values, averages, bool(substep.speed))
     known, length = tables(prepared, window), substep.length
     if not substep.inside.any():
-        return Exponents([(length * known.covariance, length * known.drift, None)], 0.0, 0.0, 0.0)
+        return Exponents([Generator(length * known.covariance, length * known.drift, np.zeros(window.size))], 0.0, 0.0, 0.0)
     precision = precision_of(prepared, substep.start, substep.inside)
     potential, constant = potential_of(known.observation, precision, substep.rates, values)
     potential = length * potential
     offset, lift = offset_of(potential, values)
-    generator = length * known.covariance, length * known.drift, potential - offset
+    generator = Generator(length * known.covariance, length * known.drift, potential - offset)
     return Exponents([generator], offset, length * constant, lift)
 
 
@@ -182,7 +142,8 @@ def _acted(
         matrices = [one.T for one in matrices[::-1]]
     if len(matrices) == 2:
         # The part of third order that two exponentials contain; they omit one of fifth order, with a factor that was measured.
-        difference = window.generator(*(late - early for early, late in zip(*exponents.generators, strict=True)))
+        early, late = exponents.generators
+        difference = window.generator(*(b - a for a, b in zip(early, late, strict=True)))
         (first, _), difference, now = matrices, difference.T if adjoint else difference, values.real
         commutator = 0.5 * (first @ (difference @ now) - difference @ (first @ now)).real
         error = 5.0 * float(np.sum(np.abs(commutator))) ** (5.0 / 3.0)
@@ -197,14 +158,11 @@ def _acted(
 
 
 class _Averages(NamedTuple):
-    """The nodes (T,) of a substep, their weights, and there f (T, N), G (T,) or (T, N), V (T, N) and the constant of V (T,)."""
+    """The nodes (T,) of a substep, their weights, and the coefficients there."""
 
     nodes: Array
     weights: Array
-    drift: Array
-    covariance: Array
-    potential: Array
-    constant: Array
+    coefficients: Coefficients
 
 
 def _at_points(prepared: Prepared, values: Array, window: lw.Window, substep: Substep) -> Callable[[Array], Coefficients]:
@@ -212,8 +170,8 @@ def _at_points(prepared: Prepared, values: Array, window: lw.Window, substep: Su
 
     def at(nodes: Array) -> Coefficients:
         times, shifts = substep.start + substep.length * nodes, substep.speed * substep.length * nodes if substep.speed else None
-        drift, *others = coefficients(prepared, window, times, substep.inside, substep.rates, values, shifts)
-        return drift - substep.speed, *others
+        known = coefficients(prepared, window, times, substep.inside, substep.rates, values, shifts)
+        return known._replace(drift=known.drift - substep.speed)
 
     return at
 
@@ -221,9 +179,9 @@ def _at_points(prepared: Prepared, values: Array, window: lw.Window, substep: Su
 def _averaged(substep: Substep, at: Callable[[Array], Coefficients], steady: bool = False) -> _Averages:
     if steady:  # one node serves
         middle = np.full(1, 0.5)
-        return _Averages(middle, np.full(1, substep.length), *at(middle))
+        return _Averages(middle, np.full(1, substep.length), at(middle))
     nodes = ((np.arange(substep.parts)[:, None] + GAUSS_NODES) / substep.parts).reshape(-1)
-    return _Averages(nodes, substep.length / substep.parts * np.tile(GAUSS_WEIGHTS, substep.parts), *at(nodes))
+    return _Averages(nodes, substep.length / substep.parts * np.tile(GAUSS_WEIGHTS, substep.parts), at(nodes))
 
 
 def _of_magnus(prepared: Prepared, values: Array, averages: _Averages, moving: bool) -> Exponents:
@@ -231,15 +189,16 @@ def _of_magnus(prepared: Prepared, values: Array, averages: _Averages, moving: b
 
     exp(B0 / 2 + 2 B1 / tau) exp(B0 / 2 - 2 B1 / tau),   B0 = int L dt,   B1 = int (t - middle) L dt.
     """
-    nodes, zeroth, drift, covariance, potential, constant = averages
+    nodes, zeroth, (drift, covariance, potential, constant) = averages
     offset, lift = offset_of(zeroth @ potential, values)
     if prepared.system.steady and not moving:
-        generator = zeroth @ covariance, zeroth @ drift, zeroth @ potential - offset
-        return Exponents([generator], offset, zeroth @ constant, lift)
+        generator = Generator(zeroth @ covariance, zeroth @ drift, zeroth @ potential - offset)
+        return Exponents([generator], offset, np.dot(zeroth, constant), lift)
     moment = 2.0 * zeroth * (nodes - 0.5)
-    halves = [(w @ covariance, w @ drift, w @ potential - 0.5 * offset) for w in (0.5 * zeroth - moment, 0.5 * zeroth + moment)]
-    lift = np.inf if any(np.any(half[0].real < 0) for half in halves) else lift
-    return Exponents(halves, offset, zeroth @ constant, lift)
+    weights = 0.5 * zeroth - moment, 0.5 * zeroth + moment
+    halves = [Generator(w @ covariance, w @ drift, w @ potential - 0.5 * offset) for w in weights]
+    lift = np.inf if any(np.any(half.covariance.real < 0) for half in halves) else lift
+    return Exponents(halves, offset, np.dot(zeroth, constant), lift)
 
 
 def magnus(
@@ -249,18 +208,17 @@ def magnus(
     """Advance a substep by the exponentials of `_of_magnus`, with as many nodes as they need.
 
     Args:
-        prepared: the system.
         values, window: the density and its grid.
-        substep: the substep.
         at: a function that returns f, G, V and a constant, as `coefficients`, at parts of the substep from zero to one.
         adjoint: whether a message is taken from the end to the start.
         moving: whether the grid moves.
     """
-    for parts in PARTS if moving else PARTS[:1]:
+    for parts in PARTS_OF_SUBSTEP if moving else PARTS_OF_SUBSTEP[:1]:
         substep = substep._replace(parts=parts)
         averages, error, length = _averaged(substep, at, not prepared.system.varying and not moving), 0.0, substep.length
         if moving:
-            error = _unresolved(window, values, length * averages.drift, length * averages.potential)
+            known = averages.coefficients
+            error = _unresolved(window, values, length * known.drift, length * known.potential)
         if error <= MAGNUS * prepared.tolerance:
             return _acted(prepared, values, window, substep, _of_magnus(prepared, values, averages, moving), adjoint, False)
     return Trial(values, 0.0, error, True)
@@ -295,7 +253,7 @@ def by_modes(prepared: Prepared, values: Array, window: lw.Window, length: float
 
 
 MOST_SUBSTEPS = 4000
-FEW = 24  # substeps of an interval, after which no large grid is used
+SUBSTEPS_OF_LARGE_GRID = 24  # substeps of an interval, after which no large grid is used
 
 
 class RecordedTransition(NamedTuple):
@@ -308,10 +266,10 @@ class RecordedTransition(NamedTuple):
     values: Array
     window: lw.Window
     length: float
-    log_mass: Any
+    log_mass: Number
     after: lw.Window
     substep: Substep | None = None
-    offset: Any = 0.0
+    offset: Number = 0.0
     margins: tuple[int, int] = 0, 0
 
 
@@ -320,7 +278,7 @@ class Prediction(NamedTuple):
 
     values: Array
     window: lw.Window
-    gained: Any
+    gained: Number
     check: lw.GridCheck | None
     transitions: tuple[RecordedTransition, ...] = ()
 
@@ -335,7 +293,10 @@ def by_decomposition(prepared: Prepared, values: Array, window: lw.Window, lengt
     known, begin = lw.grid_check(values, window.closed, negligible).aliasing, window
     while window.size <= lw.LARGEST:
         result = by_modes(prepared, values, window, length)
-        if result is None or not lost(float(np.sum(result[0].real))) < LOST_MASS:
+        if result is None:
+            return None
+        missing = abs(float(np.sum(result[0].real)) - 1.0)
+        if not missing < LOST_MASS:
             return None
         check = lw.grid_check(result[0], window.closed, negligible)
         if check.unresolved(negligible, rough):
@@ -343,7 +304,6 @@ def by_decomposition(prepared: Prepared, values: Array, window: lw.Window, lengt
         bound = edge_bound(check.aliasing)
         left, right = check.left > bound, check.right > bound
         if not (left or right):
-            missing = lost(float(np.sum(result[0].real)))
             if missing > TRANSITION_SHARE * prepared.tolerance:
                 return None
             report.time += missing
@@ -359,12 +319,7 @@ def by_decomposition(prepared: Prepared, values: Array, window: lw.Window, lengt
 
 
 def by_substeps(
-    prepared: Prepared,
-    values: Array,
-    window: lw.Window,
-    interval: TimeInterval,
-    report: Report,
-    moving: bool = False,
+    prepared: Prepared, values: Array, window: lw.Window, interval: TimeInterval, report: Report, moving: bool = False
 ) -> Prediction:
     """Return the density after an interval, by exponentials of its operator, on grids that move with it or are fixed."""
     result, tails = _by_substeps(prepared, values, window, interval, report, moving)
@@ -377,100 +332,121 @@ def by_substeps(
 
 
 def _by_substeps(
-    prepared: Prepared,
-    values: Array,
-    window: lw.Window,
-    interval: TimeInterval,
-    report: Report,
-    moving: bool,
+    prepared: Prepared, values: Array, window: lw.Window, interval: TimeInterval, report: Report, moving: bool
 ) -> tuple[Prediction, float]:
     """Return the same, and the logarithm of a bound on the growth of small values relative to the density."""
-    system, negligible, check = prepared.system, prepared.negligible, None
-    _, start, length, inside, rates = interval
-    gained: Any = 0.0
-    rough, resolved = noise_bound(prepared.tolerance), SPECTRUM_FACTOR * negligible
+    start, length = interval.start, interval.length
+    gained: Number = 0.0
     report.positive = False
     bounds = [(0.0, length)]
-    if system.varying:
+    if prepared.system.varying:
         parts = resolved_parts(prepared, values, window, interval)
         bounds, report.time = parts.bounds, report.time + parts.error
-    stack = bounds[::-1]
-    substeps, transitions, speed, tails = 0, [], 0.0, 0.0
+    stack, check = bounds[::-1], None
+    substeps, transitions, tails = 0, [], 0.0
+
+    def regridded(check: lw.GridCheck, first: float) -> tuple[Array, lw.Window]:
+        """Return the density at a time of the interval on the grid for the next substep."""
+        result = refitted(prepared, values, window, check, large=substeps < SUBSTEPS_OF_LARGE_GRID)
+        return on_grid_for_drift(prepared, *result, start + first, length - first)
+
     while stack:
         first, last = stack.pop()
         substeps += 1
-        large = window.size > lw.LARGEST and substeps < FEW
-        most = lw.SIZES[-1] if large else lw.LARGEST
         if not np.isfinite(values.real).all():
             return Prediction(values, window, np.float64(np.nan), check), tails
-        begin, grown = window, False
-        known = lw.grid_check(values, window.closed, negligible).aliasing
-        while True:
-            if moving:
-                speed = speed_of(prepared, values, window, start + first, last - first)
-            trial = trial_substep(prepared, values, window, Substep(start + first, last - first, inside, rates, speed))
-            report.decomposed = trial.substep is None
-            total = float(np.sum(trial.values.real))
-            missing = 0.0 if inside.any() else lost(total)
-            failed = not 1e-100 < total < 1e6 or missing > LOST_MASS
-            split = (trial.split or failed) and last - first > 1e-12 * length and substeps + len(stack) < MOST_SUBSTEPS
-            if split:
-                break
-            check = lw.grid_check(trial.values, window.closed, negligible)
-            coarse = check.unresolved(negligible, rough)
-            coarse = coarse and (not prepared.weak or known <= resolved)  # a finer grid has no more of the spectrum of a kink
-            bound = edge_bound(check.aliasing)
-            left, right = check.left > bound, check.right > bound
-            if not (left or right or coarse):
-                break
-            new = window
-            smooth = lw.grid_check(values, window.closed, negligible).aliasing < 0.1 * rough
-            if check.aliasing > GROSS and smooth:
-                new = window  # what such an attempt shows of the edges is not the density
-            elif left or right:
-                new, grown = lw.enlarged(new, left, right), True
-            if coarse and window.size < most and not (check.aliasing > GROSS and smooth):
-                new = lw.refined(new) if grown else finer(values, window, check)
-            if new.size <= most and new != window and not window.size == new.size == lw.SIZES[-1]:
-                values = lw.resampled(values, window, new)
-                window = new
-                continue
-            # The grid is as large as it may be: take a shorter substep, unless that does not help.
-            helps = smooth and check.aliasing > rough and (not check.rough or check.aliasing > GROSS)
-            split = (left or right or helps) and last - first > 1e-12 * length
-            split = split and substeps + len(stack) < MOST_SUBSTEPS
-            break
-        if split:
+        most = lw.SIZES[-1] if window.size > lw.LARGEST and substeps < SUBSTEPS_OF_LARGE_GRID else lw.LARGEST
+        divisible = last - first > 1e-12 * length and substeps + len(stack) < MOST_SUBSTEPS
+        part = interval.part(first, last)
+        fitted = _on_fitting_grid(prepared, values, window, part, moving, most, divisible)
+        trial, values, window, check = fitted.trial, fitted.values, fitted.window, fitted.check
+        report.decomposed = trial.substep is None
+        if fitted.split:
             if trial.split and trial.error > 0:
                 stack += parts_of_split(prepared, first, last, trial.error)[::-1]
             else:
                 middle = first + (last - first) * (0.25 if last - first > 1e-3 * length else 0.0625)
                 stack += [(middle, last), (first, middle)]
-            check = lw.grid_check(values, window.closed, negligible)
-            values, window = refitted(prepared, values, window, check, large=substeps < FEW)
-            values, window = on_grid_for_drift(prepared, values, window, start + first, length - first)
+            check = lw.grid_check(values, window.closed, prepared.negligible)
+            values, window = regridded(check, first)
             continue
         assert check is not None
         if prepared.smoothing and stack:  # what a kink leaves everywhere
             check = check._replace(aliasing=0.0, left=0.0, right=0.0)
         report.density(check)
-        if window != begin:  # noise that the new grid has brought, which the transition smooths before it is seen
-            brought = lw.grid_check(values, window.closed, negligible).aliasing
-            report.aliasing = max(report.aliasing, brought - known)
-        report.time += trial.error + missing
-        begin, after = window, lw.translated(window, speed * (last - first))
+        if stack and check.aliasing > LOST_ALIASING:  # what follows means nothing, and may take many substeps
+            return Prediction(np.full_like(values, np.nan), window, np.float64(np.nan), check), 0.0
+        report.aliasing = max(report.aliasing, fitted.brought)
+        report.time += trial.error + fitted.missing
+        after = window if trial.substep is None else lw.translated(window, trial.substep.speed * part.length)
         before, values = values, np.where(trial.values.real > 0, trial.values, 0.0)
         mass = np.sum(values)
-        transitions.append(RecordedTransition(before, begin, last - first, np.log(mass), after, trial.substep, trial.offset))
+        transitions.append(RecordedTransition(before, window, part.length, np.log(mass), after, trial.substep, trial.offset))
         tails = max(tails + trial.lift - float(np.log(mass.real)), 0.0)
         values, window = values / mass, after
         gained = gained + np.log(mass) + trial.offset
         if stack:
-            values, window = refitted(prepared, values, window, check, large=substeps < FEW)
-            values, window = on_grid_for_drift(prepared, values, window, start + last, length - last)
+            values, window = regridded(check, last)
     if substeps >= MOST_SUBSTEPS:
         report.time = np.inf
     return Prediction(values, window, gained, check, tuple(transitions)), tails
+
+
+class _Fitted(NamedTuple):
+    """A substep on a grid that holds it, and the density before on this grid; whether it is to be `split` instead.
+
+    `check` is that of the density after, `missing` the mass that was lost, and `brought` the spectrum at the highest frequencies
+    that the grid has brought, which the transition smooths before it is seen.
+    """
+
+    trial: Trial
+    values: Array
+    window: lw.Window
+    check: lw.GridCheck | None
+    split: bool
+    missing: float = 0.0
+    brought: float = 0.0
+
+
+def _on_fitting_grid(
+    prepared: Prepared, values: Array, window: lw.Window, part: TimeInterval, moving: bool, most: int, divisible: bool
+) -> _Fitted:
+    """Return a substep on grids of at most so many points; where none serves it is to be split, if it is `divisible`."""
+    negligible, rough, check = prepared.negligible, noise_bound(prepared.tolerance), None
+    known, begin, grown = lw.grid_check(values, window.closed, negligible).aliasing, window, False
+    while True:
+        speed = speed_of(prepared, values, window, part.start, part.length) if moving else 0.0
+        trial = trial_substep(prepared, values, window, Substep(part.start, part.length, part.inside, part.rates, speed))
+        total = float(np.sum(trial.values.real))
+        missing = 0.0 if part.inside.any() else abs(total - 1.0)
+        failed = not 1e-100 < total < 1e6 or missing > LOST_MASS
+        if (trial.split or failed) and divisible:
+            return _Fitted(trial, values, window, check, True)
+        check = lw.grid_check(trial.values, window.closed, negligible)
+        coarse = check.unresolved(negligible, rough)
+        # A finer grid has no more of the spectrum of a kink.
+        coarse = coarse and (not prepared.weak or known <= SPECTRUM_FACTOR * negligible)
+        bound = edge_bound(check.aliasing)
+        left, right = check.left > bound, check.right > bound
+        if not (left or right or coarse):
+            break
+        own = lw.grid_check(values, window.closed, negligible).aliasing
+        smooth, new = own < 0.1 * rough, window
+        if not (check.aliasing > GROSS and smooth):  # what such an attempt shows of the edges is not the density
+            if left or right:
+                new, grown = lw.enlarged(new, left, right), True
+            if coarse and window.size < most:
+                new = lw.refined(new) if grown else finer(values, window, check)
+        if new.size <= most and new != window and not window.size == new.size == lw.SIZES[-1]:
+            values, window = lw.resampled(values, window, new), new
+            continue
+        # The grid is as large as it may be: take a shorter substep, unless that does not help.
+        helps = smooth and check.aliasing > rough and (not check.rough or check.aliasing > GROSS)
+        if (left or right or helps) and divisible:
+            return _Fitted(trial, values, window, check, True)
+        break
+    brought = 0.0 if window == begin else lw.grid_check(values, window.closed, negligible).aliasing - known
+    return _Fitted(trial, values, window, check, False, missing, brought)
 
 
 def _normalised(

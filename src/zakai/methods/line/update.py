@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 
@@ -15,7 +14,8 @@ from zakai.methods.line.model import System
 from zakai.methods.line.prepared import Prepared, State
 from zakai.methods.system.observation import log_likelihood
 from zakai.models.numeric import numpy_function
-from zakai.models.prior import DensityPrior
+from zakai.models.prior import DensityPrior, Prior
+from zakai.numerics.arrays import Array, Number
 from zakai.numerics.complex_step import log_determinant
 from zakai.numerics.line import window as lw
 from zakai.numerics.line.averages import GAUSS_NODES, GAUSS_WEIGHTS, panels
@@ -38,9 +38,7 @@ from zakai.numerics.line.resolution import RESOLVED, TRIALS
 from zakai.numerics.line.window import Window
 from zakai.numerics.prior_grid import mixture_log_density, prior_grid
 
-Array = Any
-
-UNRESOLVED = 1e-6  # spectrum at the highest frequencies from which waves hide where a density ends, and a prior is averaged
+HIDING_WAVES = 1e-6  # spectrum at the highest frequencies from which waves hide where a density ends, and a prior is averaged
 
 
 def resampled(prepared: Prepared, values: Array, window: lw.Window, new: lw.Window) -> Array:
@@ -59,7 +57,7 @@ def grid_check(prepared: Prepared, values: Array, window: lw.Window) -> lw.GridC
     kinks of likelihoods a coarser grid would fold it, and a finer one has no more of it.
     """
     check = lw.grid_check(values, window.closed, prepared.negligible, prepared.cut)
-    if prepared.kinked or check.aliasing > UNRESOLVED:
+    if prepared.kinked or check.aliasing > HIDING_WAVES:
         noise = 0.0 if prepared.weak else 1e-2 * check.aliasing  # of waves that the transition leaves everywhere
         first, last = support(np.ascontiguousarray(values.real), max(prepared.cut, noise))
         check = check._replace(first=first, last=last)
@@ -72,10 +70,8 @@ def refitted(
     """Return a density on the grid for its next substep, and this grid.
 
     Args:
-        prepared: what is known without data.
         values: probabilities (N,).
-        window: their grid.
-        look: figures of the density by its spectrum.
+        check: figures of the density by its spectrum.
         generous: a grid of up to so many points is kept though fewer would do.
         large: whether it may have more points than a matrix of the operator.
     """
@@ -109,20 +105,24 @@ def on_fitting_grid(
         most = large
 
 
-def outside_tables(prepared: Prepared, values: Array, window: lw.Window, t: float) -> float:
+def outside_tables(prepared: Prepared, values: Array, window: lw.Points, t: float) -> float:
     """Return the share of the mass where a table is constant beyond its range."""
     return float(values.real @ prepared.system.outside(window.points, t, prepared.theta) / np.sum(values.real))
 
 
-def state_moments(prepared: Prepared, values: Array, window: lw.Window, mean: Any, variance: Any) -> tuple[Any, Any]:
-    """Return the mean and variance of the state from those of the variable of the grid, relative to its origin."""
+def state_moments(prepared: Prepared, values: Array, window: lw.Window, mean: Number, variance: Number) -> tuple[Number, Number]:
+    """Return the mean and variance of the state from those of the variable of the grid, relative to its origin.
+
+    The mean of an angle is in (-pi, pi].
+    """
     variable = variable_of(prepared.model)
     if variable is None:
-        return window.origin + mean, variance
+        mean = window.origin + mean
+        return mean - (2 * np.pi * np.ceil((mean.real - np.pi) / (2 * np.pi)) if window.closed else 0.0), variance
     offsets = variable.offset(window.points)
-    mean = offsets @ values
+    mean = np.dot(offsets, values)
     apart = offsets - mean
-    return variable.end + mean, (apart * apart) @ values
+    return variable.end + mean, np.dot(apart * apart, values)
 
 
 def edge_of_moments(prepared: Prepared, values: Array, window: lw.Window) -> float:
@@ -135,7 +135,7 @@ def edge_of_moments(prepared: Prepared, values: Array, window: lw.Window) -> flo
     return float(max(parts[0], parts[-1]) / np.sum(parts))
 
 
-def error_remainder(before: Any, predicted: Any, after: Any, spread: float) -> float:
+def error_remainder(before: Number, predicted: Number, after: Number, spread: float) -> float:
     """Return the remainder of an old relative error after a step, from the variances: that of an error of the mean in deviations.
 
     `spread` is the integral of G over the interval, which counts where the observation acts inside.
@@ -167,7 +167,7 @@ def factor_of(prepared: Prepared, k: int, observed: np.ndarray, window: lw.Windo
     return exponential_factor(prepared, k, observed) if prepared.lie and inside.any() else None
 
 
-def factor_at_end(prepared: Prepared, k: int, at_end: np.ndarray, observed: np.ndarray, window: lw.Window | None) -> Likelihood:
+def factor_at_end(prepared: Prepared, k: int, at_end: np.ndarray, observed: np.ndarray, window: lw.Points | None) -> Likelihood:
     """Return the likelihood of the samples, or of the increments that were gathered over more than the interval.
 
     `window` is a grid at which h is known where it does not depend on t.
@@ -228,15 +228,15 @@ def sampled_weakly(
     return Product(product, gained, depth, growth, window), check._replace(aliasing=error)
 
 
-def _sample_noise(prepared: Prepared, stop: float, at_end: np.ndarray) -> tuple[Array, Any]:
+def _sample_noise(prepared: Prepared, stop: float, at_end: np.ndarray) -> tuple[Array, Number]:
     """Return the precision of the observed coordinates of a sample, and the logarithm of the density's constant."""
     system, rows = prepared.system, np.flatnonzero(at_end)
 
-    def make() -> tuple[Array, Any]:
+    def make() -> tuple[Array, Number]:
         noise = system.noise(np.zeros(1), stop, prepared.theta)[np.ix_(rows, rows)]
         return np.linalg.inv(noise), -0.5 * (log_determinant(noise) + np.log(2 * np.pi) * len(rows))
 
-    result: tuple[Array, Any] = prepared.once(Derived.SAMPLE_NOISE, at_end.tobytes(), make) if system.steady_noise else make()
+    result: tuple[Array, Number] = prepared.once(Derived.SAMPLE_NOISE, at_end.tobytes(), make) if system.steady_noise else make()
     return result
 
 
@@ -255,7 +255,7 @@ def shared_noise(system: System, theta: np.ndarray, stop: float, spans: np.ndarr
     """Return the covariance of increments that end together: the integral of S over the time that two have in common."""
     common = np.minimum(spans[:, None], spans)
     if system.steady_noise:
-        return system.noise(np.zeros(1), stop, theta)[np.ix_(rows, rows)] * common
+        return np.asarray(system.noise(np.zeros(1), stop, theta)[np.ix_(rows, rows)] * common)
     total = np.zeros((len(rows), len(rows)), complex if np.iscomplexobj(theta) else float)
     for span in np.unique(spans):
         pieces = panels(lambda t: system.noise(np.zeros((len(t), 1)), t, theta.real).reshape(len(t), -1), stop - span, stop)
@@ -285,12 +285,7 @@ def averaged(evaluate: Callable[[Array], Array], window: Window) -> Array:
     return np.asarray(values / np.sum(values))
 
 
-def state_of(values: Array, window: lw.Window, error: float, log_floor: float) -> State:
-    """Return the state of probabilities on a grid."""
-    return State(values, window.origin, window.centre, window.spacing, window.unit, window.closed, error, log_floor)
-
-
-def init(prepared: Prepared, prior: Any) -> State:
+def init(prepared: Prepared, prior: Prior) -> State:
     """Return the prior on a grid that fits it."""
     model, closed, variable = prepared.model, bool(prepared.model.periodic), variable_of(prepared.model)
     if isinstance(prior, DensityPrior):
@@ -316,7 +311,7 @@ def init(prepared: Prepared, prior: Any) -> State:
 
         def evaluate(points: Array) -> Array:
             with np.errstate(all="ignore"):
-                return of_state(points) + variable.log_slope(points)[..., 0]
+                return np.asarray(of_state(points) + variable.log_slope(points)[..., 0])
 
     cut = lw.CUT if variable is None else CUT_OF_DOMAIN
     if log_density is None:
@@ -350,6 +345,6 @@ def init(prepared: Prepared, prior: Any) -> State:
         if new == window or trial == TRIALS - 1:  # the values belong to this window
             break
         window = new
-    if log_density is None and not closed and check.aliasing > UNRESOLVED:
+    if log_density is None and not closed and check.aliasing > HIDING_WAVES:
         values = averaged(evaluate, window)
-    return state_of(values, window, max(0.0, check.aliasing - 1e-12), -700.0)
+    return State.of(values, window, max(0.0, check.aliasing - 1e-12), -700.0)

@@ -8,7 +8,7 @@ steps are refined until the result settles.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple, cast
+from typing import NamedTuple
 
 import numpy as np
 
@@ -18,13 +18,12 @@ from zakai.methods.line.model import finite, within
 from zakai.methods.line.prepared import Prepared, TimeInterval
 from zakai.methods.line.report import Report
 from zakai.methods.line.transition import Prediction
+from zakai.numerics.arrays import Array, Number
 from zakai.numerics.line import window as lw
 from zakai.numerics.line.averages import GAUSS_NODES, Panels, interpolation
 from zakai.numerics.line.resolution import RESOLVED, ROUNDING, SUPPORT, TRANSITION_SHARE
 from zakai.numerics.line.volumes import Bands, Volumes, advanced, ends_of_steps, volumes
 from zakai.numerics.line.window import local_polynomial
-
-Array = Any
 
 FAST = 5.0  # ranges of a density that the drift crosses in an interval, below which it is not followed
 LEVELS = ((256, 24), (512, 34), (1024, 48), (2048, 68), (4096, 96), (8192, 136), (16384, 192))  # cells and steps
@@ -66,16 +65,14 @@ class CellPlan(NamedTuple):
 
 
 def cell_plan_of(
-    prepared: Prepared, values: Array, window: lw.Window, ends: Array, interval: TimeInterval,
+    prepared: Prepared, values: Array, window: lw.Points, ends: Array, interval: TimeInterval,
     aim: tuple[float, float] = (0.0, np.inf), widening: float = np.inf,
 ) -> CellPlan | None:  # fmt: skip
     """Return the plan of cells for a density between two offsets, None where the drift leads beyond all numbers.
 
     Args:
-        prepared: the system.
         values, window: the density before the interval, and its grid.
         ends: its ends as offsets from the origin.
-        interval: the interval.
         aim: the mean and the standard deviation of a function of the state at the end that is taken back to the start.
         widening: the most by which the range of the density grows on each side.
     """
@@ -140,7 +137,7 @@ def ends_of(values: Array, window: lw.Window) -> Array:
     return window.offsets[[max(check.first - 1, 0), min(check.last + 1, window.size - 1)]]
 
 
-def drift_along(prepared: Prepared, window: lw.Window, offsets: Array, t: float) -> Array:
+def drift_along(prepared: Prepared, window: lw.Points, offsets: Array, t: float) -> Array:
     """Return f at offsets from the origin (J,)."""
     return finite(prepared.system.drift(window.origin + offsets[:, None], t, prepared.theta.real)[:, 0])
 
@@ -182,7 +179,7 @@ class FlowSummary(NamedTuple):
     high: float
 
 
-def _flow_summary(prepared: Prepared, window: lw.Window, ends: Array, start: float, steps: Array) -> FlowSummary:
+def _flow_summary(prepared: Prepared, window: lw.Points, ends: Array, start: float, steps: Array) -> FlowSummary:
     """Follow Gaussian parts of a density between two offsets by exponential Euler steps."""
     count, width = _FLOW_POINTS, float(ends[1] - ends[0])
     x, t, travel, most = np.linspace(float(ends[0]), float(ends[1]), count), start, 0.0, 0.0
@@ -210,13 +207,13 @@ def _relative(x: Array) -> Array:
     return np.where(small, 1.0, np.expm1(x) / np.where(small, 1.0, x))
 
 
-FINE = 300.0  # phase by which the drift turns the shortest wave of a large grid, above which that is not tried
-STIFF = 100.0  # the same, above which no uniform grid is tried
+TURNING_OF_LARGE_GRID = 300.0  # phase by which the drift turns the shortest wave of a large grid, above which that is not tried
+TURNING = 100.0  # the same, above which no uniform grid is tried
 MOST_TRAVEL = 20.0  # ranges of a density, as it is at the time, that it moves on uniform grids
 MOST_DEVIATIONS = 100.0  # range of a density on a uniform grid, in the smallest deviations of its parts
-EDGE = 1e-9  # density in the outermost cells, relative to the maximum, beyond which they are too few
+EDGE_OF_CELLS = 1e-9  # density in the outermost cells, relative to the maximum, beyond which they are too few
 SETTLED = 1e-2  # error above which volumes do not serve
-NARROWEST = 40.0  # range of a density in cells
+NARROWEST_IN_CELLS = 40.0  # range of a density in cells
 WIDENINGS = 0.5, 2.0  # ranges of a density by which it grows on each side, where that error is too large
 SMOOTH = 1e-7  # error of a backward interval at which more cells are not tried
 
@@ -229,12 +226,7 @@ def rough(prepared: Prepared, inside: np.ndarray) -> bool:
 
 
 def contracted(
-    prepared: Prepared,
-    values: Array,
-    window: lw.Window,
-    interval: TimeInterval,
-    report: Report,
-    moving: bool,
+    prepared: Prepared, values: Array, window: lw.Window, interval: TimeInterval, report: Report, moving: bool
 ) -> Prediction | None:
     """Return the density after an interval, None where volumes do not serve or a uniform grid, which may move, is better."""
     if window.closed:
@@ -242,7 +234,7 @@ def contracted(
     ends, start, length = ends_of(values, window), interval.start, interval.length
     drift = drift_along(prepared, window, ends, start)
     width, speed = float(ends[1] - ends[0]), 0.5 * float(np.ptp(drift)) if moving else float(np.max(np.abs(drift)))
-    fine = window.size > lw.LARGEST and np.pi * speed * length > FINE * window.spacing
+    fine = window.size > lw.LARGEST and np.pi * speed * length > TURNING_OF_LARGE_GRID * window.spacing
     # The noise of the logarithm of a state grows without limit towards a natural end.
     noise = float(np.max(covariance_at(prepared.system, window.points, start, prepared.theta.real)))
     rounding = ROUNDING * 0.5 * (np.pi / window.spacing) ** 2 * noise * length
@@ -265,16 +257,16 @@ def contracted(
             return None
         if leak is not None:
             plan = plan._replace(cells=plan.cells.reaching(*leak))
-        stiff = stiff_noise or speed * length > STIFF * width
+        stiff = stiff_noise or speed * length > TURNING * width
         far = (plan.flow.travel > MOST_TRAVEL and not moving) or plan.flow.deviations > MOST_DEVIATIONS
-        if not (general or stiff or far) or width < NARROWEST * plan.finest:  # sharper than the cells where it begins
+        if not (general or stiff or far) or width < NARROWEST_IN_CELLS * plan.finest:  # sharper than the cells where it begins
             return None
         result = advanced_by(prepared, density, plan, interval, allowed)
         if result is None:
             return None
         masses, cells, gained, error = result
         after = np.abs((masses / cells.widths).real)
-        if max(after[0], after[-1]) <= max(EDGE, unresolved) * np.max(after):
+        if max(after[0], after[-1]) <= max(EDGE_OF_CELLS, unresolved) * np.max(after):
             break
     else:  # the cells do not hold it
         return None
@@ -290,34 +282,28 @@ class Settled(NamedTuple):
 
     values: Array
     cells: Volumes
-    log_scale: Any
+    log_scale: Number
     error: float
 
 
 def advanced_by(
-    prepared: Prepared,
-    density: Callable[[Array], Array],
-    plan: CellPlan,
-    interval: TimeInterval,
-    allowed: float,
+    prepared: Prepared, density: Callable[[Array], Array], plan: CellPlan, interval: TimeInterval, allowed: float
 ) -> Settled | None:
     """Return the masses of cells after an interval, None where they do not settle.
 
     Args:
-        prepared: the system.
         density: the density before, as a function of offsets (J,).
         plan: the plan of the cells.
-        interval: the interval.
         allowed: the error at which more cells are not tried.
     """
 
-    def at_level(cells: Volumes, steps: Array) -> tuple[Array, Any]:
+    def at_level(cells: Volumes, steps: Array) -> tuple[Array, Number]:
         before = density(cells.offsets)
         masses = before * cells.widths
         return _advanced(masses / np.sum(masses), prepared, before, cells, interval, steps, plan)
 
     def summed(masses: Array) -> Array:
-        return masses.reshape(-1, 2).sum(axis=1)
+        return np.asarray(masses.reshape(-1, 2).sum(axis=1))
 
     return _settled(allowed, plan, at_level, summed, lambda cells: np.ones(cells.size))
 
@@ -331,9 +317,9 @@ class BackwardExpectation(NamedTuple):
     error: float
 
     def at(self, offsets: Array) -> Array:
-        """Return the values at offsets from the origin (J,)."""
+        """Return the values at offsets from the origin (J,), beyond the outermost middles those there."""
         size = self.cells.size
-        index = self.cells.place(np.clip(offsets, *self.cells.faces[[0, -1]]))
+        index = self.cells.place(np.clip(offsets, *self.cells.offsets[[0, -1]]))
         return local_polynomial(self.values, lw.Window(0.0, size // 2 + 0.5, 1.0, size, False, 1.0), index)
 
 
@@ -347,16 +333,14 @@ def pulled_back(
     """Return the expectation of a function of the state after an interval, given the state before; None where it does not settle.
 
     Args:
-        prepared: the system.
-        log_worth: the logarithm of the function at offsets (J,).
+        log_values: the logarithm of the function at offsets (J,).
         density: the density before the interval, as a function of offsets (J,).
         plan: the plan of the cells, None where there is none.
-        interval: the interval.
     """
     if plan is None:
         return None
 
-    def at_level(cells: Volumes, steps: Array) -> tuple[Array, Any]:
+    def at_level(cells: Volumes, steps: Array) -> tuple[Array, Number]:
         logs = log_values(cells.offsets)
         top = float(np.max(logs))
         before = density(cells.offsets)
@@ -365,16 +349,18 @@ def pulled_back(
 
     def between(result: Array) -> Array:
         padded = np.concatenate([result[:1], result, result[-1:]])
-        return (9.0 * (result[::2] + result[1::2]) - padded[:-2:2] - padded[3::2]) / 16.0
+        return np.asarray((9.0 * (result[::2] + result[1::2]) - padded[:-2:2] - padded[3::2]) / 16.0)
 
     result = _settled(SMOOTH, plan, at_level, between, lambda cells: density(cells.offsets) * cells.widths)
-    return None if result is None else BackwardExpectation(result.cells, result.values, float(result.log_scale), result.error)
+    if result is None:
+        return None
+    return BackwardExpectation(result.cells, result.values, float(result.log_scale.real), result.error)
 
 
 def _settled(
     allowed: float,
     plan: CellPlan,
-    at_level: Callable[[Volumes, Array], tuple[Array, Any]],
+    at_level: Callable[[Volumes, Array], tuple[Array, Number]],
     paired: Callable[[Array], Array],
     weights: Callable[[Volumes], Array],
 ) -> Settled | None:
@@ -419,13 +405,13 @@ def _advanced(
     ends: Array,
     plan: CellPlan,
     backward: bool = False,
-) -> tuple[Array, Any]:
+) -> tuple[Array, Number]:
     """Return the masses of cells after steps, and the logarithm of their sum; `density` is the one before the interval."""
-    at, bounds, (_, start, _, inside, rates) = cast(lw.Window, cells), plan.bounds, interval  # by its points
+    bounds, (_, start, _, inside, rates) = plan.bounds, interval
     known: dict[int, Bands] = {}
 
     def operators(times: Array) -> Bands:
-        drift, covariance, potential, constant = coefficients(prepared, at, times, inside, rates, density)
+        drift, covariance, potential, constant = coefficients(prepared, cells, times, inside, rates, density)
         drift = np.where(np.abs(drift) < plan.fastest, drift, plan.fastest * np.sign(drift.real))
         covariance = covariance if covariance.ndim == 2 else covariance[:, None]
         return cells.bands(covariance, drift, potential + constant[:, None] - offset)
@@ -444,7 +430,7 @@ def _advanced(
 
     offset = 0.0
     if inside.any():
-        *_, potential, constant = coefficients(prepared, at, np.array([start]), inside, rates, density)
+        *_, potential, constant = coefficients(prepared, cells, np.array([start]), inside, rates, density)
         counts = density.real > 1e-6 * density.real.max()
         offset = float(np.max(potential[0, : cells.size][counts].real) + constant[0].real)
     masses, gained = advanced(bands, masses, ends, backward)

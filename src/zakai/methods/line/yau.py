@@ -8,7 +8,7 @@ In the gauge u = e^phi v the equation of an interval is linear-quadratic, so tha
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -16,11 +16,10 @@ from zakai.methods.yau.kernel import PowerSeries
 from zakai.methods.yau.system import YauSystem
 from zakai.models.kept import once_for_a_model
 from zakai.models.model import Model
+from zakai.numerics.arrays import Array
 from zakai.numerics.flow import FlowResult, Transition, integrate
 
-Array = Any
-
-UNRESOLVED = 1e-10  # relative error of a transition from which the coefficients in time are not resolved
+UNRESOLVED_IN_TIME = 1e-10  # relative error of a transition from which the coefficients in time are not resolved
 
 
 class YauLine(YauSystem):
@@ -77,7 +76,7 @@ class YauLine(YauSystem):
             result = integrate(
                 lambda t, _: self.coefficients(t, theta, at, acting, full), begins, begins + times, not self.varies(acting)
             )
-            return result._replace(error=np.where(result.error > UNRESOLVED, result.error, 0.0))
+            return result._replace(error=np.where(result.error > UNRESOLVED_IN_TIME, result.error, 0.0))
 
         which = np.unique(inside[rows], axis=0, return_inverse=True)[1].reshape(-1)
         groups = [rows[which == i] for i in range(which.max() + 1)]

@@ -126,14 +126,13 @@ class ConditionalLaw(Law):
         slopes = [[sp.diff(h, symbol) for symbol in block.v(model)] for h in model.observation]
         self._slopes = numpy_function(sp.Matrix(slopes), model, (model.m, len(block.linear)))
 
-    def noise(self, x: Array, t: float, theta: Array, u: Array | None) -> Array:
-        """Return S + C P C' (m, m) at a point of (x, P), S at a point of x."""
+    def spread(self, x: Array, t: float, theta: Array, u: Array | None) -> Any:
+        """Return C P C' (m, m) at a point of (x, P), zero at a point of x."""
         n = self.model.n
-        S = super().noise(x[:n], t, theta, u)
         if len(x) == n:
-            return S
+            return 0.0
         C = np.asarray(self._slopes(x[:n], t, theta, u))
-        return S + C @ covariances(self.block, x[n:, None])[0] @ C.T
+        return C @ covariances(self.block, x[n:, None])[0] @ C.T
 
     def _formulas(self, shapes: list[sp.Expr]) -> tuple[list[sp.Expr], list[list[int]]]:
         terms, places = super()._formulas(shapes)

@@ -14,6 +14,7 @@ References:
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -81,8 +82,7 @@ def init(prepared: Prepared, prior: Any) -> State:
     if gaussian is not None:
         return begun(prepared, gaussian, count)
     rng = np.random.Generator(np.random.Philox(key=prepared.key(0, PRIOR)))
-    nowhere = np.zeros(system.n), np.zeros((system.n, 0))
-    return _at_start(prepared, system.drawn(prior, prepared.theta, count, rng), np.zeros((0, count)), nowhere)
+    return begun_at(prepared, system.drawn(prior, prepared.theta, count, rng))
 
 
 def begun(prepared: Prepared, gaussian: tuple[Array, Array], count: int) -> State:
@@ -90,6 +90,12 @@ def begun(prepared: Prepared, gaussian: tuple[Array, Array], count: int) -> Stat
     first = np.empty((gaussian[1].shape[1], count))
     normals(prepared.key(0, PRIOR), 0, count, first)
     return _at_start(prepared, np.ascontiguousarray(gaussian[0][:, None] + gaussian[1] @ first), first, gaussian)
+
+
+def begun_at(prepared: Prepared, particles: Array) -> State:
+    """Return equally weighted particles (n, N), whose start is not moved."""
+    n, count = particles.shape
+    return _at_start(prepared, particles, np.zeros((0, count)), (np.zeros(n), np.zeros((n, 0))))
 
 
 def _at_start(prepared: Prepared, particles: Array, first: Array, gaussian: tuple[Array, Array]) -> State:
@@ -168,7 +174,7 @@ def _step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[Stat
     start, narrow = cloud, control.narrow
     for last_turn in (False, True):
         # Errors are measured in deviations after the observation, by how much the last one, or this one, has narrowed them.
-        steps, control = _steps(prepared, interval, values, state, (before.mean, narrow * scale))
+        steps, control = substeps(prepared, interval, values, state, (before.mean, narrow * scale))
         events = with_update(motion.events(interval, steps.scheme, values, before.mean, scale), system, observed)
         done = _advanced(prepared, start, events, observed, number)
         after = moments_of(system, done.cloud.particles, done.weights)
@@ -255,10 +261,10 @@ def _step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[Stat
 
 def _allowed(control: Control, count: int) -> float:
     """Return the error of a mean by the time step, in standard deviations, that an interval may have."""
-    return float(np.clip(OF_RANDOM_ERROR * np.sqrt(control.variance / count), TIME_ERROR, MOST_TIME_ERROR))
+    return min(max(OF_RANDOM_ERROR * math.sqrt(control.variance / count), TIME_ERROR), MOST_TIME_ERROR)
 
 
-def _steps(
+def substeps(
     prepared: Prepared, interval: Interval, values: Array, state: State, about: tuple[Array, Array]
 ) -> tuple[Steps, Control]:
     """Return the substeps of an interval, measured where the last measurement does not hold any more, and the controls."""
@@ -303,7 +309,7 @@ def _observed(prepared: Prepared, interval: Interval, values: Array) -> Observed
     system, theta, t = prepared.system, prepared.theta, interval.stop
     u = None if interval.inputs is None else interval.inputs.at(t, system.model.input_hold)
     if system.law is not None:
-        return Observed(t, *system.law.given(values, interval.seen, t, theta, u))
+        return Observed(t, *system.law.given(values, interval.seen, prepared.motion.law_parameters(t, u), u))
     m, late = system.m, np.flatnonzero(interval.seen & ~interval.inside)
     P = np.zeros((m, m))
     if len(late):
@@ -361,9 +367,8 @@ class Drawn(NamedTuple):
 
 def _narrowing(cov: Array, before: Array) -> float:
     """Return the smallest ratio of the deviations of a state after and before the observation."""
-    wide = before > 0
-    ratios = np.sqrt(np.maximum(np.diag(cov), 0.0))[wide] / before[wide]
-    return float(np.clip(np.nanmin(ratios, initial=1.0), NARROWEST, 1.0))
+    ratios = np.sqrt(np.maximum(np.diag(cov), 0.0)) / before
+    return min(max(min((ratio for ratio in ratios.tolist() if ratio >= 0.0), default=1.0), NARROWEST), 1.0)
 
 
 def _linearised(target: Target, cloud: Cloud, plain: Advanced) -> Any:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import sympy as sp
@@ -74,9 +74,11 @@ class Law:
         shapes = [next((model.family_parameters[key] for key in model.family_parameters if key[1] == j), sp.S.Zero)
                   for j in range(m)]  # fmt: skip
         self.fixed_shapes = [not shape.free_symbols & set(model.x) for shape in shapes]
+        self.constant = not {*noise.free_symbols}.union(*(shape.free_symbols for shape in shapes)) & {*model.x, model.t, *model.u}
         self.numbers = Numbers.of(m, self.coupled)
         self._noise, self._shapes = numpy_function(noise, model, (m, m)), numpy_function(shapes, model)
         self.joint = model.log_density is None and self.coupled and self.fixed
+        self._logarithmic = np.array([family == "log-normal" for family in model.observation_family])
         self._gaussian = [j for j in range(m) if model.observation_family[j] == "gaussian"]
         terms, self._terms = self._formulas(shapes)
         self._expressions = Expressions(terms, model, self.numbers.symbols, self.more, self.defined)
@@ -96,23 +98,31 @@ class Law:
         """Return S (m, m) at a state."""
         return np.asarray(self._noise(x, t, theta, u))
 
-    def given(self, values: Array, seen: Array, t: float, theta: Array, u: Array | None) -> tuple[Array, Array]:
+    def spread(self, x: Array, t: float, theta: Array, u: Array | None) -> Any:
+        """Return the covariance (m, m) of h at a point whose linear states are known by their mean and covariance."""
+        return 0.0
+
+    def parameters(self, t: float, theta: Array, u: Array | None) -> tuple[Array, Array]:
+        """Return S (m, m) and the parameters (m,) of the families at a time, where they do not depend on the state."""
+        m, nowhere = self.model.m, np.zeros(self.model.n)
+        if self.model.log_density is not None:
+            return np.eye(m), np.zeros(m)
+        with np.errstate(all="ignore"):
+            S = self.noise(nowhere, t, theta, u) if self.fixed else np.eye(m)
+            return S, self._shapes(nowhere, t, theta, u)
+
+    def given(self, values: Array, seen: Array, parameters: tuple[Array, Array], u: Array | None) -> tuple[Array, Array]:
         """Return the given numbers (width,) of one observation, and which terms of the law count (terms,) as 1 or 0.
 
         Args:
             values: (m,), zero where nothing is observed.
             seen: (m,).
-            t: the time.
-            theta: the parameters (p,).
-            u: the inputs at t.
+            parameters: those of the law at that time.
+            u: the inputs then.
         """
-        m, numbers = self.model.m, self.numbers
+        m, numbers, (S, shape) = self.model.m, self.numbers, parameters
         P, c = np.zeros((m, m)), np.zeros(m)
         if self.model.log_density is None:
-            nowhere = np.zeros(self.model.n)
-            with np.errstate(all="ignore"):
-                S = self.noise(nowhere, t, theta, u) if self.fixed else np.eye(m)
-                shape = self._shapes(nowhere, t, theta, u)
             which = np.flatnonzero(seen)
             if self.coupled:
                 P[np.ix_(which, which)] = np.linalg.inv(S[np.ix_(which, which)])
@@ -128,8 +138,9 @@ class Law:
                 block = 2 * np.pi * S[np.ix_(own, own)]
                 c[self._gaussian[0]] = -0.5 * np.linalg.slogdet(block)[1]
         pairs = [P[pair] for pair in numbers.pairs]
-        positive = np.array([name == "log-normal" for name in self.model.observation_family]) & seen
-        values = np.where(positive, np.log(np.where(positive, values, 1.0)), values)
+        if self._logarithmic.any():
+            positive = self._logarithmic & seen
+            values = np.where(positive, np.log(np.where(positive, values, 1.0)), values)
         row = np.concatenate([[] if u is None else u, values, pairs, c, seen.astype(float)])
         return row, np.array([float(seen[places].any()) for places in self._terms])
 

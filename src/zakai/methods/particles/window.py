@@ -65,7 +65,7 @@ class Window(NamedTuple):
     @property
     def width(self) -> int:
         """The number of normal numbers of a particle."""
-        return len(self.first) + sum(len(noise) for noise in self.noises[: self.length])
+        return len(self.first) + sum(map(len, self.noises[: self.length]))
 
     def resampled(self, ancestors: Array) -> Window:
         """Return the window of particles with these ancestors."""
@@ -286,7 +286,7 @@ class Target:
         rows = self.events.rows[self.events.rows[:, 2] > 0]
         coins = rows[:, 0] + rows[:, 1] + (0 if self.prior is None else self.prior[1].shape[1])  # of which no path is smooth
         gain: Array = np.zeros((D, n))
-        posterior = _Precision.of([np.zeros((0, D))])
+        posterior = None
         for _ in range(rounds):
             points = np.repeat(point[:, None], 1 + D + moving, axis=1)
             points[np.arange(D), 1 + np.arange(D)] += _STEP
@@ -318,6 +318,7 @@ class Target:
                 return None
             posterior = _Precision.of([np.zeros((0, D)), *informing])
             point = posterior.solve(right)
+        assert posterior is not None
         if moving:
             gain = -posterior.solve(across)
         informed = posterior.values > _INFORMED
@@ -342,7 +343,8 @@ class Target:
             seen = np.flatnonzero(self.given[k, -system.m :])
             r = values - h
             r[law.angles] -= 2 * np.pi * np.round(r[law.angles] / (2 * np.pi))
-            inverse = np.linalg.inv(law.noise(x, t, theta, u)[np.ix_(seen, seen)])
+            S = self.motion.law_parameters(t, u)[0] if law.fixed else law.noise(x[: system.model.n], t, theta, u)
+            inverse = np.linalg.inv((S + law.spread(x, t, theta, u))[np.ix_(seen, seen)])
             weighted = inverse @ H[seen]
             slope[read], information[np.ix_(read, read)] = r[seen] @ weighted, H[seen].T @ weighted
             return slope, information

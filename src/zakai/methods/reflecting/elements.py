@@ -11,7 +11,7 @@ ends (`line/volumes.py`) take the other intervals.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -22,18 +22,17 @@ from zakai.methods.line.prepared import Prepared, TimeInterval
 from zakai.methods.line.report import Report
 from zakai.methods.line.volumes import advanced_by, cell_plan_of, kinks_between
 from zakai.models.domain import Interval
+from zakai.numerics.arrays import Array, Number
 from zakai.numerics.line.averages import GAUSS_NODES, GAUSS_WEIGHTS
 from zakai.numerics.line.grid_choice import DEPTH, WIDENING
 from zakai.numerics.line.operator import Spectral
 from zakai.numerics.line.resolution import RESOLVED, TRANSITION_SHARE, rounding_bound
 from zakai.numerics.lobatto import Element
 
-Array = Any
-
-SIZES = (24, 32, 48, 64, 96, 128, 192, 256)
-SIZES_OF_PRIORS = (*SIZES, 512, 1024)  # of which no operator is decomposed
+ELEMENT_SIZES = (24, 32, 48, 64, 96, 128, 192, 256)
+SIZES_OF_PRIORS = (*ELEMENT_SIZES, 512, 1024)  # of which no operator is decomposed
 SAMPLES = 1001  # points at which the place of a density is sought
-MARGIN = 0.02  # of the length of an element, within which of its end a kink does not count
+MARGIN_OF_KINK = 0.02  # of the length of an element, within which of its end a kink does not count
 BESIDE = 1e-6  # the same for an end of the domain
 
 
@@ -48,8 +47,8 @@ def element_of(prepared: Prepared, lower: float, upper: float, size: int) -> Ele
     unit, width, domain = 2.0 ** np.ceil(np.log2(upper - lower)), upper - lower, domain_of(prepared)
     low, high = float(unit * np.floor(lower / unit)), float(unit * np.ceil(upper / unit))
     known = prepared.once(Derived.KINKS, (low, high), lambda: kinks_between(prepared, low, high, prepared.model.start).tolist())
-    first = lower + width * (BESIDE if lower <= domain.lower else MARGIN)
-    last = upper - width * (BESIDE if upper >= domain.upper else MARGIN)
+    first = lower + width * (BESIDE if lower <= domain.lower else MARGIN_OF_KINK)
+    last = upper - width * (BESIDE if upper >= domain.upper else MARGIN_OF_KINK)
     return Element(lower, upper, size, tuple(kink for kink in known if first < kink < last))
 
 
@@ -95,7 +94,7 @@ def sampled(
     lower: float,
     upper: float,
     negligible: float,
-    sizes: tuple[int, ...] = SIZES,
+    sizes: tuple[int, ...] = ELEMENT_SIZES,
 ) -> tuple[Element, Array]:
     """Return the fewest points that resolve a density, and its probabilities there."""
     for size in sizes:
@@ -157,12 +156,12 @@ def decomposed(prepared: Prepared, element: Element) -> Operator | None:
 def operator_at(prepared: Prepared, element: Element, t: float) -> Operator | None:
     """Return the operator on an element at a time and its decomposition; None where there is none."""
     system, theta, x = prepared.system, prepared.theta, element.points
-    G = covariance_at(system, x, np.asarray(t), theta) * np.ones(len(x))
+    G = covariance_at(system, x, t, theta) * np.ones(len(x))
     if not (G.real > 0).all():
         return None
     drift, steps = system.drift(x[:, None], t, theta)[:, 0], np.diff(x)
     nodes = (x[:-1, None] + steps[:, None] * GAUSS_NODES).reshape(-1)
-    slopes = system.drift(nodes[:, None], t, theta)[:, 0] / covariance_at(system, nodes, np.asarray(t), theta)
+    slopes = system.drift(nodes[:, None], t, theta)[:, 0] / covariance_at(system, nodes, t, theta)
     gauge = np.concatenate([np.zeros(1), np.cumsum(steps * (slopes.reshape(len(steps), -1) @ GAUSS_WEIGHTS))])
     logs = gauge - 0.5 * np.log(G)
     if not np.isfinite(logs.real).all() or not np.isfinite(drift.real).all():
@@ -174,10 +173,10 @@ def operator_at(prepared: Prepared, element: Element, t: float) -> Operator | No
 
 def weighted(
     prepared: Prepared, known: Operator, element: Element, interval: TimeInterval, values: Array
-) -> tuple[Spectral, Array, Any]:
+) -> tuple[Spectral, Array, Number]:
     """Return the modes with the potential of increments less a number, its integral over time, and that of the number."""
     _, start, length, inside, rates = interval
-    h, precision = tables(prepared, element).observation, precision_of(prepared, start, inside)  # type: ignore[arg-type]
+    h, precision = tables(prepared, element).observation, precision_of(prepared, start, inside)
     potential, constant = potential_of(h, precision, rates, values)
     offset, _ = offset_of(length * potential, values)
     return known.weighted(potential - offset / length), length * (potential + constant), offset + length * constant
@@ -187,14 +186,14 @@ def logarithm(values: Array) -> Array:
     return np.log(np.maximum(values, 1e-300))
 
 
-def moments(values: Array, element: Element) -> tuple[Any, Any]:
+def moments(values: Array, element: Element) -> tuple[Number, Number]:
     x = element.points - element.lower
-    mean = x @ values
-    return element.lower + mean, ((x - mean) ** 2) @ values
+    mean = np.dot(x, values)
+    return element.lower + mean, np.dot((x - mean) ** 2, values)
 
 
 COUNTS = 1e-14  # density relative to the maximum beyond which it is rounding
-EDGE = 1e-12  # density at an end that is not one of the domain, relative to the maximum
+EDGE_OF_ELEMENT = 1e-12  # density at an end that is not one of the domain, relative to the maximum
 TRIALS = 24  # elements that are tried
 MOST_PARTS = 64  # of an interval that the volumes do not take as a whole
 PEAK = 1.5  # points in a standard deviation of the noise with which the first element begins
@@ -202,7 +201,7 @@ PEAK = 1.5  # points in a standard deviation of the noise with which the first e
 
 def propagated(
     prepared: Prepared, values: Array, element: Element, interval: TimeInterval, report: Report, negligible: float
-) -> tuple[Array, Element, Any]:
+) -> tuple[Array, Element, Number]:
     """Return the density after an interval, its points, and the logarithm of its mass."""
     arguments = prepared, values, element, interval, report, negligible
     result = None if prepared.system.varying else _by_modes(*arguments)
@@ -217,7 +216,7 @@ def propagated(
 
 def _by_modes(
     prepared: Prepared, values: Array, element: Element, interval: TimeInterval, report: Report, negligible: float
-) -> tuple[Array, Element, Any] | None:
+) -> tuple[Array, Element, Number] | None:
     """Return the density after an interval, its points, and the logarithm of its mass; None where modes do not serve."""
     domain, allowed = domain_of(prepared), rounding_bound(prepared.tolerance)
     _, start, length, inside, _ = interval
@@ -226,11 +225,12 @@ def _by_modes(
     counts = np.flatnonzero((values / element.weights).real > COUNTS * np.max((values / element.weights).real))
     low, high = element.points[[max(counts[0] - 1, 0), min(counts[-1] + 1, len(values) - 1)]]
     lower, upper = apart(float(low - WIDENING * noise[1]), float(high + WIDENING * noise[1]), domain)
-    longest = float(np.max(element_of(prepared, lower, upper, SIZES[0]).halves))
+    longest = float(np.max(element_of(prepared, lower, upper, ELEMENT_SIZES[0]).halves))
     needed = min(2.0 * PEAK * longest / max(noise[0], 1e-300), element.size * longest / float(np.max(element.halves)))
-    size = next((size for size in SIZES if size >= min(needed, SIZES[4])), SIZES[-1])
+    size = next((size for size in ELEMENT_SIZES if size >= min(needed, ELEMENT_SIZES[4])), ELEMENT_SIZES[-1])
     for _ in range(TRIALS):
-        new, offset = element_of(prepared, lower, upper, size), 0.0
+        new = element_of(prepared, lower, upper, size)
+        offset: Number = 0.0
         known = decomposed(prepared, new)
         if known is None:
             return None
@@ -248,9 +248,9 @@ def _by_modes(
             growth = float(np.sum(raised) / np.sum(result.real))
         coarse = unresolved > negligible
         # Oscillations of what is not resolved reach the ends as well.
-        left, right = (float(end) > (unresolved if coarse else EDGE) for end in reached(result, new, domain))
-        if coarse and size < SIZES[-1]:
-            size = SIZES[SIZES.index(size) + 1]
+        left, right = (float(end) > (unresolved if coarse else EDGE_OF_ELEMENT) for end in reached(result, new, domain))
+        if coarse and size < ELEMENT_SIZES[-1]:
+            size = ELEMENT_SIZES[ELEMENT_SIZES.index(size) + 1]
         elif coarse:
             return None
         elif left or right:
@@ -282,7 +282,7 @@ def _projected(values: Array, element: Element, new: Element, known: Operator, n
 
 def _by_volumes(
     prepared: Prepared, values: Array, element: Element, interval: TimeInterval, report: Report, negligible: float
-) -> tuple[Array, Element, Any]:
+) -> tuple[Array, Element, Number]:
     """Return the density after an interval, its points, and the logarithm of its mass, in parts where volumes do not settle."""
     stack, gained, count = [(0.0, interval.length)], 0.0 * values[0], 0
     while stack:
@@ -303,7 +303,7 @@ def _by_volumes(
 
 def _part(
     prepared: Prepared, values: Array, element: Element, interval: TimeInterval, report: Report, negligible: float
-) -> tuple[Array, Element, Any] | None:
+) -> tuple[Array, Element, Number] | None:
     """Return the density after a part of an interval from finite volumes, None where these do not settle."""
     domain, at = domain_of(prepared), element
 
@@ -311,7 +311,7 @@ def _part(
         return at.at(values, at.lower + offsets)
 
     ends = np.array([0.0, at.upper - at.lower])
-    plan = cell_plan_of(prepared, values, at, ends, interval)  # type: ignore[arg-type]  # by its points
+    plan = cell_plan_of(prepared, values, at, ends, interval)
     if plan is None:
         return None
     result = advanced_by(prepared, before, plan, interval, TRANSITION_SHARE * prepared.tolerance)

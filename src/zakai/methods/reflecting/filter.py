@@ -8,7 +8,7 @@ The points cover the part of the domain in which the density is; at an end that 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -20,8 +20,8 @@ from zakai.methods.line.prepared import NOISE, Prepared
 from zakai.methods.line.report import Report
 from zakai.methods.line.update import error_remainder, factor_at_end, outside_tables, spread
 from zakai.methods.reflecting.elements import (
+    ELEMENT_SIZES,
     SAMPLES,
-    SIZES,
     SIZES_OF_PRIORS,
     domain_of,
     element_of,
@@ -36,13 +36,12 @@ from zakai.methods.reflecting.elements import (
     without_nan,
 )
 from zakai.models.numeric import numpy_function
-from zakai.models.prior import DensityPrior
+from zakai.models.prior import DensityPrior, Prior
+from zakai.numerics.arrays import Array, Number
 from zakai.numerics.line.grid_choice import DEPTH
 from zakai.numerics.line.product import General, Likelihood, normalized, place
 from zakai.numerics.lobatto import Element
 from zakai.numerics.prior_grid import mixture_log_density, prior_grid
-
-Array = Any
 
 DEPTH_OF_PRODUCT = 70.0  # logarithm of the density below its maximum, from which a product does not come
 
@@ -67,7 +66,7 @@ class State(NamedTuple):
         return Element(float(self.lower), float(self.upper), size, tuple(np.asarray(self.cuts).tolist()))
 
 
-def init(prepared: Prepared, prior: Any) -> State:
+def init(prepared: Prepared, prior: Prior) -> State:
     """Return the prior, which counts inside of the domain."""
     model, domain = prepared.model, domain_of(prepared)
     if isinstance(prior, DensityPrior):
@@ -114,22 +113,22 @@ def _top(logs: Callable[[Array], Array], lower: float, upper: float) -> float:
 
 def _multiplied(
     prepared: Prepared, values: Array, element: Element, likelihood: Likelihood, report: Report, negligible: float
-) -> tuple[Any, ...]:
+) -> tuple[Array, Element, Number]:
     """Return the product with a likelihood, its points, and the logarithm of its mass."""
     domain, new, density = domain_of(prepared), element, values / element.weights
     largest = float(np.max(density.real))
 
-    def product() -> tuple[Array, Any, float, float]:
+    def product() -> tuple[Array, Number, float, float]:
         return normalized(density, without_nan(likelihood.logs(new.points)), new.weights, largest)
 
     result, gained, depth, growth = product()
     if not new.unresolved(result) < negligible or _narrow(result, new):
-        lowest = logarithm(largest) - DEPTH_OF_PRODUCT
-        ends = place(element.offsets, np.maximum(logarithm(density.real), lowest), likelihood, element.lower)
+        logs = logarithm(density.real)
+        ends = place(element.offsets, np.maximum(logs, np.max(logs) - DEPTH_OF_PRODUCT), likelihood, element.lower)
         if ends is not None:
             low, high = with_margin(element.lower + ends[0], element.lower + ends[1], domain)
             low, high = max(low, element.lower), min(high, element.upper)
-            for size in SIZES:
+            for size in ELEMENT_SIZES:
                 new = element_of(prepared, low, high, size)
                 density = element.at(values, new.points)
                 result, gained, depth, growth = product()
@@ -155,8 +154,8 @@ def step(prepared: Prepared, k: int, state: State, observed: np.ndarray) -> tupl
 
 def _step(prepared: Prepared, k: int, state: State, observed: np.ndarray) -> tuple[State, Info]:
     schedule, length, inside = prepared.schedule, float(prepared.lengths[k]), prepared.inside[k]
-    values, report, gained = np.asarray(state.values), Report(), 0.0
-    element: Any = state.element  # in the place of a grid
+    values, report, element = np.asarray(state.values), Report(), state.element
+    gained: Number = 0.0
     check_escape(prepared, k, element.points, values)
     before, negligible = moments(values, element), negligible_of(prepared, float(state.error))
     if length > 0:

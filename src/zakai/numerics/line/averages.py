@@ -8,16 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from zakai.numerics.arrays import Array
 from zakai.numerics.compiled import helper
 from zakai.numerics.line.density import highest_of
 from zakai.numerics.line.steps import CELL, DRIFT, IMPOSSIBLE, SLOPE, Coefficients, add, exponent_added, observation_of
-
-Array = NDArray[Any]
 
 NODES = 6
 _nodes, _weights = np.polynomial.legendre.leggauss(NODES)
@@ -27,7 +25,7 @@ GAUSS_WEIGHTS: Array = _weights / 2.0
 PROBES = 129  # times of an interval at which coefficients are compared with their interpolants
 _PROBES_OF_PART = 21
 _PROBES = np.linspace(0.0, 1.0, PROBES)
-RESOLVED = 1e-8  # relative error of the interpolants of coefficients in time
+RESOLVED_IN_TIME = 1e-8  # relative error of the interpolants of coefficients in time
 MOST_PARTS = 16  # in which an interval is cut at a time
 _MOST = 600
 
@@ -57,7 +55,7 @@ def parts_needed(exact: Array, nodes: Array) -> Array:
     exact, nodes = exact.reshape(*exact.shape[:2], -1), nodes.reshape(*nodes.shape[:2], -1)
     scale = np.maximum(np.abs(exact).max(axis=1), 1e-300)
     rest = np.abs(_TO_PROBES @ nodes - exact).max(axis=1) / scale
-    excess = rest.max(axis=1) / RESOLVED
+    excess = rest.max(axis=1) / RESOLVED_IN_TIME
     if (excess <= 1.0).all():
         return np.ones(len(excess), int)
     more = np.ceil(1.1 * np.nan_to_num(excess) ** (1.0 / len(GAUSS_NODES)))

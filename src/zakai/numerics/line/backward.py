@@ -10,18 +10,17 @@ A decomposition acts on psi = F e^s b on a longer grid, with an F that falls to 
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numba import boolean, float64, int64, types
-from numpy.typing import NDArray
 
+from zakai.numerics.arrays import Array
 from zakai.numerics.compiled import helper, kernel
 from zakai.numerics.line.averages import AVERAGES, EARLY, LATE, MEAN, MOST_MAGNUS, WHOLE, averaged, averaging, operators
 from zakai.numerics.line.density import circular_moments, highest_of, moments, shifted, spectrum, support, waves
 from zakai.numerics.line.modes import decayed, propagate
-from zakai.numerics.line.resolution import ROUNDING as PRECISION
-from zakai.numerics.line.resolution import SMOOTHER_SHARE
+from zakai.numerics.line.resolution import ROUNDING, SMOOTHER_SHARE
 from zakai.numerics.line.splitting import STEEPEST, Filtering, differences, residual, split
 from zakai.numerics.line.steps import (
     CONSTANTS_TYPE,
@@ -38,11 +37,9 @@ from zakai.numerics.line.steps import (
 )
 from zakai.numerics.line.window import CUT
 
-Array = NDArray[Any]
-
 UNRESOLVED = 1e-5  # spectrum of a smoothed density at the highest frequencies up to which sums over the points are integrals
 FEWEST = 12  # points of a message
-ROUNDING = 1e-15  # of the maximum: smaller values of psi count as this
+SMALLEST = 1e-15  # of the maximum: smaller values of psi count as this
 SURE = 100.0  # errors of psi from which its small values count
 LEAST = 1e-11  # of the maximum: the same
 LOG_MASS, MEAN_AT, VARIANCE, ALIASING, EDGE, ERROR = range(6)  # what is reported of a smoothed density
@@ -197,7 +194,7 @@ def _decomposed(
     most, negligible, (products, out) = limits.error, limits.negligible, results
     cosines, sines, long_cosines, long_sines = waves
     size, longer, reliable, ratio = product.size, rates.size, 0.0, 0.0
-    b, now = np.empty(size), np.empty(longer)
+    b, propagated = np.empty(size), np.empty(longer)
     first, last = (0, size - 1) if closed else support(product, negligible)
     at = place + stride * highest_of(product)
     for j in range(size):
@@ -208,22 +205,22 @@ def _decomposed(
         for j in range(longer):
             top = max(top, likelihood[j])
         for j in range(longer):
-            now[j] = psi[j] * np.exp(likelihood[j] - top)
-            norm += now[j] * now[j]
+            propagated[j] = psi[j] * np.exp(likelihood[j] - top)
+            norm += propagated[j] * propagated[j]
         for j in range(first, last + 1):
             b[j] *= np.exp(likelihood[place + stride * j] - likelihood[at])
         between, decay = spread(b, first, last), decayed(rates, tau)
-        propagate(modes, decay, now)
-        highest = now[highest_of(now)]
-        noise = PRECISION * np.sqrt(norm) * max(1.0, decay[0])
-        left, right, _, _, _, aliasing, _, _, _ = spectrum(now, CUT, CUT, long_cosines, long_sines, False)
-        level = max(noise, (ROUNDING + 2.0 * aliasing) * highest)
+        propagate(modes, decay, propagated)
+        highest = propagated[highest_of(propagated)]
+        noise = ROUNDING * np.sqrt(norm) * max(1.0, decay[0])
+        left, right, _, _, _, aliasing, _, _, _ = spectrum(propagated, CUT, CUT, long_cosines, long_sines, False)
+        level = max(noise, (SMALLEST + 2.0 * aliasing) * highest)
         # b relative to where its product with the density is largest.
         density, least = densities[i], floors[i] * densities[i, highest_of(densities[i])]
         reference, weight, total = -np.inf, 0.0, 0.0
         for j in range(size):
             if density[j] > least:
-                inner = max(now[place + stride * j], ROUNDING * highest)
+                inner = max(propagated[place + stride * j], SMALLEST * highest)
                 reference = max(reference, np.log(inner * density[j]) - gauge[place + stride * j])
         if not (-np.inf < reference < np.inf):
             return completed, error, scale, reliable
@@ -231,7 +228,7 @@ def _decomposed(
             b[j] = 0.0
             if density[j] > least:
                 ratio = np.exp(-gauge[place + stride * j] - reference)
-                b[j] = max(now[place + stride * j], ROUNDING * highest) * ratio
+                b[j] = max(propagated[place + stride * j], SMALLEST * highest) * ratio
                 weight += density[j] * ratio
                 total += density[j] * b[j]
         made = level * weight / total + (0.0 if closed else 10.0 * max(left, right))
@@ -246,7 +243,7 @@ def _decomposed(
         row[ERROR] = error
         scale, reliable = np.log(highest / total) - reference, max(SURE * level / highest, LEAST)
         for j in range(longer):
-            psi[j] = now[j] / highest
+            psi[j] = propagated[j] / highest
     return lengths.size, error, scale, reliable
 
 
@@ -276,7 +273,7 @@ def by_modes(
         small, peak = np.flatnonzero(psi <= least), gauged.place + gauged.stride * int(np.argmax(products[count - completed]))
         first = int(np.max(small, where=small < peak, initial=-1)) + 1
         last = int(np.min(small, where=small > peak, initial=len(psi))) - 1
-    psi = np.maximum(psi, ROUNDING)
+    psi = np.maximum(psi, SMALLEST)
     result = Message(psi, scale, first, last, 0, error, message.product)
     return BackwardSteps(result, completed, products[count - completed :], out[count - completed :])
 
@@ -301,22 +298,20 @@ def held(before: Array, by: int, after: Array, noise: float) -> bool:
 
 @helper
 def _split(
-    now: Array, product: Array, table: Array, c: Coefficients, averages: Array, places: tuple[int, int, int],
+    values: Array, product: Array, table: Array, c: Coefficients, averages: Array, places: tuple[int, int, int],
     shape: tuple[float, bool], accuracy: tuple[float, float],
 ) -> tuple[float, float]:  # fmt: skip
     """Replace b by that before a split interval; return its error, infinite where it is not accurate, and the constant.
 
     Args:
-        now: b (N,).
+        values: b (N,).
         product: the smoothed density (N,) at the end.
         table: the terms of f and h at the points.
-        c: the coefficients of the interval.
-        averages: the weights of averages.
         places: the point of which exponents are differences, and the first and the last point of b.
         shape: the spacing, and whether the grid goes around the circle.
         accuracy: the depth of the tails and the largest error.
     """
-    size, (at, first, last), (spacing, closed), (depth, most) = now.size, places, shape, accuracy
+    size, (at, first, last), (spacing, closed), (depth, most) = values.size, places, shape, accuracy
     phi, slope, curvature, drift, b = np.empty(size), np.empty(size), np.empty(size), np.empty(size), np.empty(size)
     made, constant, magnus = 0.0, 0.0, 0
     if averages.shape[0] > 1:
@@ -348,7 +343,7 @@ def _split(
                     return np.inf, 0.0
         for j in range(size):
             phi[j] = -phi[j]
-        noise, _ = split(now, phi, b, slope, Filtering(spread, -shift, float(whole), depth, narrow), spacing, closed)
+        noise, _ = split(values, phi, b, slope, Filtering(spread, -shift, float(whole), depth, narrow), spacing, closed)
         made, constant = made + error / float(whole) ** 4 + noise, constant + added
         if not (made < most * 2.0 + 1e-2 * most):
             return np.inf, 0.0
@@ -387,7 +382,7 @@ def _adjoint(
             low = max(min(first, begins + starts[i] - start) - margin, low)
             high = min(max(last, ends + starts[i] - start) + margin, high)
         points = high - low + 1
-        local, now, result = np.empty((table.shape[1], table.shape[2], points)), np.empty(points), np.zeros(size)
+        local, inner, result = np.empty((table.shape[1], table.shape[2], points)), np.empty(points), np.zeros(size)
         copied(table[i if timed else 0], start + low, local)
         at, before = highest_of(product), spread(b, first, last)
         row[LOG_MASS] = logs[i, at]
@@ -395,14 +390,14 @@ def _adjoint(
             result[j] = b[j] * np.exp(logs[i, j] - logs[i, at])
         between = spread(result, first, last)
         for j in range(points):
-            now[j] = result[low + j]
+            inner[j] = result[low + j]
         c = Coefficients(drifts[i], outputs[i], precisions[i], covariances[i], observed[i], lengths[i], kinds[i] == SPLIT)
         places = at - low, first - low, last - low
         made, constant = _split(
-            now, product[low : high + 1], local, c, averages, places, (spacing, closed), (depth, most)
+            inner, product[low : high + 1], local, c, averages, places, (spacing, closed), (depth, most)
         )
         for j in range(size):
-            result[j] = now[j - low] if low <= j <= high else 0.0
+            result[j] = inner[j - low] if low <= j <= high else 0.0
         row[LOG_MASS] += constant
         if not (made < np.inf):
             return completed, first, last, start, error

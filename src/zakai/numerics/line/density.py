@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import Any
 
 import numpy as np
 from numba import boolean, float64, int64, types
-from numpy.typing import NDArray
 
+from zakai.numerics.arrays import Array
 from zakai.numerics.compiled import helper, kernel
-
-Array = NDArray[Any]
 
 _F = float64
 
@@ -127,9 +124,7 @@ def spectrum_of_many(values: Array, cut: float, negligible: float) -> tuple[floa
 
 
 @kernel(types.UniTuple(_F, 9)(_F[::1], _F, _F, _F[:, ::1], _F[:, ::1], boolean), reordered=True)  # type: ignore[no-untyped-call]
-def spectrum(
-    values: Array, cut: float, negligible: float, cosines: Array, sines: Array, search: bool
-) -> tuple[float, ...]:
+def spectrum(values: Array, cut: float, negligible: float, cosines: Array, sines: Array, search: bool) -> tuple[float, ...]:
     """Return figures of the ends and of the spectrum of values (N,), N > 2; of a large grid few frequencies are computed.
 
     Args:

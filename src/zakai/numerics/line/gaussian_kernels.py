@@ -14,29 +14,28 @@ into the tails.  Else it is a filter that is exact for band-limited densities, w
 from __future__ import annotations
 
 from math import erfc
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numba import complex128, float64, int64
-from numpy.typing import NDArray
 
+from zakai.numerics.arrays import Array, Number
 from zakai.numerics.compiled import helper, kernel
 from zakai.numerics.exponentials import exponentiate
 from zakai.numerics.line.density import highest_of
 from zakai.numerics.line.steps import Transition, failed
 from zakai.numerics.transition import Transition as LinearTransition
 
-Array = NDArray[Any]
 
 class Channel(NamedTuple):
     """The kernel for given inputs: a, b, V, k0, k1, k2."""
 
-    scale: Any
-    shift: Any
-    variance: Any
-    constant: Any
-    slope: Any
-    curvature: Any
+    scale: Number
+    shift: Number
+    variance: Number
+    constant: Number
+    slope: Number
+    curvature: Number
 
 
 def chosen(transitions: LinearTransition, k: int, inputs: Array) -> Channel:
@@ -109,22 +108,22 @@ def narrow_taps(variance: float) -> tuple[Array, Array]:
 
 
 @helper
-def filtered(now: Array, taps: Array, after: Array, scale: Array, narrow: bool) -> tuple[float, float]:
+def filtered(values: Array, taps: Array, after: Array, scale: Array, narrow: bool) -> tuple[float, float]:
     """Replace values by after times their convolution with a Gaussian, whose filter is given.
 
     The filter is short, so that the rounding of a value is relative to values nearby.  A narrow kernel has negative parts: values
     that are rounding become zero, each by itself, because a mode may lie beyond them.  Returns the rounding error relative to the
     sum, and the largest value that may have become zero relative to the maximum, both of values times a scale.
     """
-    size = now.size
+    size = values.size
     count = 1 + min(size, taps.size) // 2 * 2
     padded, weights, moduli = np.zeros(size + 2 * count), np.zeros(count), np.empty(size)
     for n in range(min(count, taps.size)):
         weights[n] = taps[n]
     for j in range(size):
-        padded[count + j] = now[j]
-        now[j] *= weights[0]
-        moduli[j] = abs(now[j])
+        padded[count + j] = values[j]
+        values[j] *= weights[0]
+        moduli[j] = abs(values[j])
     for n in range(1, count, 2):
         below, above = padded[count - n : count - n + size], padded[count + n : count + n + size]
         lower, higher = padded[count - n - 1 : count - n - 1 + size], padded[count + n + 1 : count + n + 1 + size]
@@ -132,49 +131,49 @@ def filtered(now: Array, taps: Array, after: Array, scale: Array, narrow: bool) 
         if narrow:
             for j in range(size):
                 inner, outer = below[j] + above[j], lower[j] + higher[j]
-                now[j] += near * inner + far * outer
+                values[j] += near * inner + far * outer
                 moduli[j] += abs(near) * inner + abs(far) * outer
         else:
             for j in range(size):
-                now[j] += near * (below[j] + above[j]) + far * (lower[j] + higher[j])
+                values[j] += near * (below[j] + above[j]) + far * (lower[j] + higher[j])
     total, top, noise, lost = 0.0, 0.0, 0.0, 0.0
     for j in range(size):
         weight = after[j] * scale[j]
         if narrow:
             noise += 4e-16 * moduli[j] * weight
-            if not now[j] > 1e-12 * moduli[j]:
-                now[j] = 0.0
+            if not values[j] > 1e-12 * moduli[j]:
+                values[j] = 0.0
                 lost = max(lost, 1e-12 * moduli[j] * weight)
-        total += now[j] * weight
-        top = max(top, now[j] * weight)
-        now[j] *= after[j]
+        total += values[j] * weight
+        top = max(top, values[j] * weight)
+        values[j] *= after[j]
     if not (0.0 < total < np.inf):
         return np.inf, 1.0
     return 2e-15 + noise / total, lost / top
 
 
 @kernel(float64(float64[::1], float64[::1], float64, float64, float64))
-def wrapped(now: Array, inner: Array, shift: float, variance: float, depth: float) -> float:
+def wrapped(values: Array, inner: Array, shift: float, variance: float, depth: float) -> float:
     """Replace values on the circle by their convolution with a Gaussian of this mean, in spacings; return the rounding error."""
-    size, half = now.size, 0.5 / variance
+    size, half = values.size, 0.5 / variance
     if 2.0 * (np.pi / size) ** 2 * variance > 40.0:  # nothing is left of any wave
         total = 0.0
         for j in range(size):
-            total += now[j]
+            total += values[j]
         for j in range(size):
-            now[j] = total / size
+            values[j] = total / size
         return 2e-15
     top, near = 1.0 / np.sqrt(2.0 * np.pi * variance), int(np.floor(shift + 0.5))
     reach = int(np.ceil(np.sqrt(2.0 * depth * variance)))
     for j in range(size):
-        inner[j] = now[j]
-        now[j] = 0.0
+        inner[j] = values[j]
+        values[j] = 0.0
     for n in range(near - reach, near + reach + 1):
         weight, by = top * np.exp(-half * (n - shift) ** 2), n % size
         for j in range(by, size):
-            now[j] += weight * inner[j - by]
+            values[j] += weight * inner[j - by]
         for j in range(by):
-            now[j] += weight * inner[j - by + size]
+            values[j] += weight * inner[j - by + size]
     return 2e-15
 
 
@@ -216,26 +215,25 @@ def kernel_of(parameters: Array, observed: Array, length: float, to: Array) -> N
 
 @helper
 def convolved(
-    now: Array, phi: Array, channel: Array, middle: float, spacing: float, finest: float, depth: float, closed: bool
+    density: Array, phi: Array, channel: Array, middle: float, spacing: float, finest: float, depth: float, closed: bool
 ) -> Transition:
     """Replace a density by that after a Gaussian kernel in the gauge e^phi.
 
     Args:
-        now: the density (N,).
+        density: the density (N,).
         phi: phi (N,).
         channel: a, b, V, k0, k1, k2.
         middle: the point of the index N // 2, relative to the origin of the kernel.
-        spacing: the spacing of the grid.
         finest: the smallest spacing that may be asked for.
         depth: the depth of the tails, as a logarithm below the maximum, to which filters are accurate.
         closed: whether the grid goes around the circle.
     """
-    size = now.size
+    size = density.size
     early, late, gauge = np.empty(size), np.empty(size), np.empty(size)
     a, shift, variance, k0, k1, k2 = channel[0], channel[1], channel[2], channel[3], channel[4], channel[5]
     if not (variance > 0.0 and a > 0.0):
         return failed(variance, 0.0)
-    width, needed, at = variance / a / (spacing * spacing), 0.0, highest_of(now)
+    width, needed, at = variance / a / (spacing * spacing), 0.0, highest_of(density)
     narrow: bool = width < WIDE
     if narrow:
         needed = spacing * np.sqrt(width / (1.1 * WIDE))
@@ -252,10 +250,10 @@ def convolved(
         if a != 1.0 or k1 != 0.0 or k2 != 0.0:
             return failed(variance, 0.0)
         for j in range(size):
-            now[j] /= gauge[j]
-        rounding, clipped = wrapped(now, early, shift / spacing, width, depth), 0.0
+            density[j] /= gauge[j]
+        rounding, clipped = wrapped(density, early, shift / spacing, width, depth), 0.0
         for j in range(size):
-            now[j] *= gauge[j]
+            density[j] *= gauge[j]
     else:
         log_factor -= 0.5 * shift * shift / variance
         pull, square = k1 - a * shift / variance, k2 + 0.5 * a * (1.0 - a) / variance
@@ -266,9 +264,9 @@ def convolved(
             if not (_LEAST < early[j] < 1.0 / _LEAST and _LEAST < late[j] < 1.0 / _LEAST):  # products may underflow
                 return failed(variance, 0.0)
         for j in range(size):
-            now[j] *= early[j]
+            density[j] *= early[j]
             early[j] = 1.0
-        rounding, clipped = filtered(now, taps_of(width, depth, size, narrow), late, early, narrow)
+        rounding, clipped = filtered(density, taps_of(width, depth, size, narrow), late, early, narrow)
     return Transition(0.0, rounding, clipped, variance, a, needed, log_factor, 0.0, 0.0)
 
 
@@ -280,7 +278,7 @@ _APPLIED = [
 
 @kernel(*_APPLIED)
 def applied(
-    sources: Array, first: float, spacing: float, size: int, weights: Array, scale: Any, shift: Any, variance: Any
+    sources: Array, first: float, spacing: float, size: int, weights: Array, scale: Number, shift: Number, variance: Number
 ) -> Array:
     """Return sum_j N(x_i; scale y_j + shift, variance) weights_j at x_i = first + spacing i, i = 0 .. size - 1, by recurrence."""
     result = np.zeros(size, weights.dtype)

@@ -7,16 +7,14 @@ in a spacing, and by polynomials through eight of them between: the values of h,
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from zakai.numerics.arrays import Array
 from zakai.numerics.compiled import helper
 from zakai.numerics.line.density import highest_of
 from zakai.numerics.line.window import ALIGNMENT, SIZES, SMALL, STENCIL_WEIGHTS
-
-Array = NDArray[Any]
 
 PER = 8  # points of rows in a spacing of the grid
 _STENCIL = len(STENCIL_WEIGHTS)
@@ -100,9 +98,7 @@ def _surveyed(
 
 
 @helper
-def placed(
-    logs: Array, first: int, last: int, likelihood: Likelihood
-) -> tuple[float, float, float]:
+def placed(logs: Array, first: int, last: int, likelihood: Likelihood) -> tuple[float, float, float]:
     """Return the range of the product as indices of the grid, and the narrowest cell in it; NaN where there are too many.
 
     Cells whose bound is far below the largest value are left out, and the others divided until the likelihood hardly changes.
@@ -110,7 +106,6 @@ def placed(
     Args:
         logs: the logarithm of the density (N,).
         first, last: the points between which it is not negligible.
-        likelihood: the likelihood.
     """
     left, width, level, best = np.empty(MOST_CELLS), np.empty(MOST_CELLS), np.empty((MOST_CELLS, 3)), -np.inf
     weights, h, count, done = np.empty(_STENCIL), np.empty(likelihood.rows.shape[0]), last - first, 0
@@ -190,7 +185,7 @@ def differences(h: Array, centre: Array, general: bool, precision: Array, observ
 
 @helper
 def sampled(
-    q: Array, ends: tuple[int, int], grid: tuple[float, float, float], likelihood: Likelihood, now: Array, b: Array
+    q: Array, ends: tuple[int, int], grid: tuple[float, float, float], likelihood: Likelihood, density: Array, b: Array
 ) -> tuple[float, float, float, float, bool]:
     """Write a density on a grid for its product with a likelihood, and the logarithm of that.
 
@@ -198,8 +193,7 @@ def sampled(
         q: the density (N,) on a coarse grid.
         ends: the points between which it is not negligible.
         grid: the first point of the coarse grid, its spacing, and the unit of spacings.
-        likelihood: the likelihood.
-        now: receives the density (n,).
+        density: receives the density (n,).
         b: receives the logarithm (n,).
 
     Returns:
@@ -207,7 +201,7 @@ def sampled(
         the logarithms are differences; the error of these; and whether the grid has enough points.
     """
     (grid_first, grid_spacing, unit), (rows, general, precision, observed) = grid, likelihood
-    top, n, m, weights = q[highest_of(q)], now.size, rows.shape[0], np.empty(8)
+    top, n, m, weights = q[highest_of(q)], density.size, rows.shape[0], np.empty(8)
     logs = np.empty(q.size)
     for j in range(q.size):
         logs[j] = np.log(max(q[j], 1e-30 * top))
@@ -221,7 +215,7 @@ def sampled(
     at, h, middle, rough, unsure = np.empty(n), np.empty((n, m)), np.empty(m), np.empty(m), 0.0
     for i in range(n):
         at[i] = (centre + spacing * (i - n // 2) - grid_first) / grid_spacing
-    interpolated(q, top, at, now, weights)
+    interpolated(q, top, at, density, weights)
     for i in range(n):
         begin = weigh(at[i] * PER, rows.shape[1], 1, weights)
         for r in range(m):
@@ -229,14 +223,14 @@ def sampled(
     best, most = -np.inf, 0
     for i in range(n):
         b[i] = log_likelihood(h[i], general, precision, observed)
-        if now[i] > 0.0 and np.log(now[i]) + b[i] > best:
-            best, most = np.log(now[i]) + b[i], i
+        if density[i] > 0.0 and np.log(density[i]) + b[i] > best:
+            best, most = np.log(density[i]) + b[i], i
     for r in range(m):
         middle[r] = h[most, r]
     constant, total = b[most], 0.0
     for i in range(n):
         b[i] = differences(h[i], middle, general, precision, observed)
-        weight = np.exp(np.log(now[i]) + b[i] + constant - best) if now[i] > 0.0 else 0.0
+        weight = np.exp(np.log(density[i]) + b[i] + constant - best) if density[i] > 0.0 else 0.0
         if weight > 1e-12:
             begin = weigh(at[i] * PER, rows.shape[1], 2, weights)
             for r in range(m):

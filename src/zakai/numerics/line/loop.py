@@ -16,8 +16,8 @@ from typing import Any
 
 import numpy as np
 from numba import float64, int64, types
-from numpy.typing import NDArray
 
+from zakai.numerics.arrays import Array
 from zakai.numerics.compiled import kernel
 from zakai.numerics.line.averages import AVERAGES, WHOLE
 from zakai.numerics.line.density import circular_rows, highest_of, moments, separated, shifted, spectrum, support, waves
@@ -32,7 +32,6 @@ from zakai.numerics.line.steps import (
     FAILED,
     GRID_TYPE,
     KERNEL,
-    MARGIN,
     OK,
     PHI,
     RANGE,
@@ -42,6 +41,7 @@ from zakai.numerics.line.steps import (
     STATUSES,
     STEPS_TYPE,
     TABLE,
+    TABLE_MARGIN,
     UNRESOLVED,
     Coefficients,
     Constants,
@@ -61,8 +61,6 @@ from zakai.numerics.line.steps import (
     product,
 )
 from zakai.numerics.line.window import ALIGNMENT, CUT
-
-Array = NDArray[Any]
 
 COARSE = 1e-5  # spectrum of a product at the highest frequencies from which a somewhat finer grid does not serve
 _V, _M = float64[::1], float64[:, ::1]
@@ -87,8 +85,8 @@ def _loop(kernels: bool, splits: bool, varying: bool, samples: bool, weak: bool,
         averages, cosines, sines = known
         densities, out = results
         negligible, most, generous, size, length = limits[0], limits[1], limits[4], values.size, table.shape[3]
-        half, timed, near = size // 2, table.shape[0] > 1, length == size + 2 * MARGIN
-        now, local = values.copy(), np.empty((table.shape[1], table.shape[2], size))
+        half, timed, near = size // 2, table.shape[0] > 1, length == size + 2 * TABLE_MARGIN
+        density, local = values.copy(), np.empty((table.shape[1], table.shape[2], size))
         b, change, channel, answer = np.empty(size), np.empty(size), np.empty(6), out[-1]
         channel[0] = np.nan
         home, place, status, done = start, -1, OK, 0
@@ -101,7 +99,7 @@ def _loop(kernels: bool, splits: bool, varying: bool, samples: bool, weak: bool,
                     seen |= precisions[k, 0, j, j] != 0.0
             c = Coefficients(drifts[k], outputs[k], precisions[k], covariances[k], observed[i], tau, inside)
             cut = max(limits[3], min(30.0 * np.exp(log_floor), CUT))
-            low, high = support(now, cut)
+            low, high = support(density, cut)
             if place != start or timed:
                 copied(table[own], start, local)
                 place = start
@@ -109,7 +107,7 @@ def _loop(kernels: bool, splits: bool, varying: bool, samples: bool, weak: bool,
                 kernel_of(kernel_parameters[k], observed[i], tau if kind == KERNEL else np.inf, channel)
             if not closed:
                 middle = offset + spacing * (start + half)
-                first, last = extent(now, (low, high), channel, local, c, middle, spacing, cut)
+                first, last = extent(density, (low, high), channel, local, c, middle, spacing, cut)
                 answer[0], answer[1], answer[2], status = first, last, spacing, OK
                 if not (last - first < 1e9):
                     status = FAILED
@@ -120,23 +118,23 @@ def _loop(kernels: bool, splits: bool, varying: bool, samples: bool, weak: bool,
                     break
                 if first < 0 or last > size - 1:
                     by = ALIGNMENT * int(np.floor((0.5 * (first + last) - half) / ALIGNMENT + 0.5))
-                    if abs(by) > length or start + by < 0 or start + by + size > length or (near and abs(by) > MARGIN // 2):
+                    if abs(by) > length or start + by < 0 or start + by + size > length or (near and abs(by) > TABLE_MARGIN // 2):
                         status = RANGE
                         break
-                    now = shifted(now, by)
+                    density = shifted(density, by)
                     start, place = start + by, start + by
                     copied(table[own], start, local)
-                    low, high = support(now, cut)
+                    low, high = support(density, cut)
             # The transition.
-            at, before = highest_of(now), moments(now)[2]
+            at, before = highest_of(density), moments(density)[2]
             depth, finest = 8.0 - np.log(cut), (high - low) * 1.2 * spacing / (limits[5] - 2 * ALIGNMENT)
             move = failed(0.0, 0.0)
             if kernels and not np.isnan(channel[0]):
                 middle = offset + spacing * (start + half)
-                move = convolved(now, local[0, PHI], channel, middle, spacing, finest, depth, closed)
+                move = convolved(density, local[0, PHI], channel, middle, spacing, finest, depth, closed)
             elif splits:
                 accuracy = Accuracy(depth, limits[2] * shares[k], finest)
-                move = divided(now, local, c, averages, spacing, closed, varying, accuracy)
+                move = divided(density, local, c, averages, spacing, closed, varying, accuracy)
             if not (move.error < np.inf and move.rounding < max(LEAST_ROUNDING, 1e-3 * most)):
                 answer[0], answer[1], answer[2] = float(low), float(high), move.needed
                 status = RANGE if move.needed > 0.0 and not (move.error < np.inf) else FAILED
@@ -144,11 +142,11 @@ def _loop(kernels: bool, splits: bool, varying: bool, samples: bool, weak: bool,
             positive = move.needed == 0.0
             asked = Resolution(positive, weak or not seen, cut, negligible, spacing)
             status, mass, aliasing, edge, negative, highest = checked(
-                now, (low, high), weak, closed, asked, (cosines, sines), answer
+                density, (low, high), weak, closed, asked, (cosines, sines), answer
             )
             if status != OK:
                 break
-            predicted, gained = moments(now)[2], np.log(mass) + constants[k] + move.log_factor
+            predicted, gained = moments(density)[2], np.log(mass) + constants[k] + move.log_factor
             log_floor *= min(max(predicted / max(move.contraction**2 * before, 1e-300), 1.0), 20.0)
             log_floor = max(log_floor, np.log(max(cut, move.clipped)))
             floor = np.exp(log_floor) + edge + (0.0 if positive else aliasing)
@@ -159,13 +157,13 @@ def _loop(kernels: bool, splits: bool, varying: bool, samples: bool, weak: bool,
                 gained += likelihood(h, centre, precisions[k, 0], observed[i], b)
                 if weak:
                     weaken(fine, start, precisions[k, 0], observed[i], centre, b, change)
-                added, growth, below = product(now, b)
+                added, growth, below = product(density, b)
                 left, right, answer[0], answer[1], _, aliasing, _, top, _ = spectrum(
-                    now, cut, negligible, cosines, sines, not weak
+                    density, cut, negligible, cosines, sines, not weak
                 )
                 limit = SPECTRUM_FACTOR * negligible
                 if weak:  # of a kink the spectrum falls slowly
-                    aliasing, limit = 0.5 * weak_error(now, change), WEAK_SHARE * most
+                    aliasing, limit = 0.5 * weak_error(density, change), WEAK_SHARE * most
                 else:
                     highest = top
                 if not (aliasing <= limit):
@@ -181,7 +179,7 @@ def _loop(kernels: bool, splits: bool, varying: bool, samples: bool, weak: bool,
                     edge = max(edge, min(left, right) if positive else max(left, right))
                 worst, gained = max(worst, aliasing), gained + added
             # The report.
-            row[1], row[2] = moments(now)[1:]
+            row[1], row[2] = moments(density)[1:]
             made = step_error(worst, edge, negative, move.rounding + move.error, floor * growth)
             if not (made <= most):
                 status = FAILED
@@ -189,7 +187,7 @@ def _loop(kernels: bool, splits: bool, varying: bool, samples: bool, weak: bool,
             ratio = np.sqrt(max(before * row[2], 0.0)) / max(predicted, 1e-300)
             if inside:
                 ratio *= np.exp(-min(0.5 * move.spread / max(before * spacing * spacing, 1e-300), 5.0))
-            ratio = 1.0 if separated(now) else min(max(ratio, 0.3), 1.0)
+            ratio = 1.0 if separated(density) else min(max(ratio, 0.3), 1.0)
             # No estimate is reliable far below the tolerance.
             error = max(made + error * ratio, RELIABLE * most)
             row[0], row[3], row[4], row[5], row[6] = gained, worst, edge, negative, move.rounding + move.error
@@ -197,7 +195,7 @@ def _loop(kernels: bool, splits: bool, varying: bool, samples: bool, weak: bool,
             log_floor = min(log_floor + max(below - 1.0, 0.0), 0.0)
             row[8], row[9], row[10], row[11] = growth, made, error, log_floor
             for j in range(size):
-                densities[i, j] = now[j]
+                densities[i, j] = density[j]
             row[12], row[13], row[14], row[15] = start, move.pairs, move.substeps, move.needed
             home, done = start, i + 1
             # Whether the same grid serves for the next step: as in `window.fitted`.
@@ -206,7 +204,7 @@ def _loop(kernels: bool, splits: bool, varying: bool, samples: bool, weak: bool,
                 status = AFTER
             elif closed:
                 status = AFTER if size > generous and size > 2.2 * size / resolving else OK
-            elif near and abs(start - MARGIN) > MARGIN // 3:
+            elif near and abs(start - TABLE_MARGIN) > TABLE_MARGIN // 3:
                 status = TABLE
             if status != OK:
                 break
@@ -233,7 +231,6 @@ def advance(
     Args:
         mechanisms: what the steps may need.
         state: where the steps begin.
-        grid: the grid.
         steps: the intervals, of which `first` is the first that is taken.
         observed: what is observed in the intervals from there on (K, m), zero where nothing is.
         limits: what a step must keep, as the fields of `Limits`.

@@ -12,15 +12,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from zakai.numerics.arrays import Array
 from zakai.numerics.complex_step import real_product
 from zakai.numerics.line.resolution import ROUNDING
 
-Array = NDArray[Any]
 
 @lru_cache(maxsize=64)
 def derivatives(size: int, closed: bool) -> tuple[Array, Array]:
@@ -50,14 +49,21 @@ def derivative_between(size: int, closed: bool) -> Array:
     return np.asarray(-0.5 * sign / (size * np.sin(np.pi * offset / size) ** 2) if closed else -sign / (np.pi * offset**2))
 
 
-def generator(closed: bool, spacing: float, covariance: Any, drift: Array, potential: Array | None = None) -> Array:
+class Generator(NamedTuple):
+    """G, () or (N,), f (N,) and V (N,) at the points of a grid, or integrals over time of these."""
+
+    covariance: Array
+    drift: Array
+    potential: Array
+
+
+def generator(closed: bool, spacing: float, covariance: Array, drift: Array, potential: Array) -> Array:
     """Return L (N, N) for G, one number or (N,), f (N,) and V (N,), or integrals over time of these."""
     size = len(drift)
     first, second = derivatives(size, closed)
     scale = np.float64(1.0 if closed else spacing)  # whose powers may overflow
     matrix = (0.5 * covariance / scale**2) * second - first * (drift / scale)
-    if potential is not None:
-        matrix[np.arange(size), np.arange(size)] += potential
+    matrix[np.arange(size), np.arange(size)] += potential
     return np.asarray(matrix)
 
 
@@ -107,7 +113,7 @@ def exponential(matrix: Array) -> Array:
 _INVERSE_FACTORIALS = 1.0 / np.cumprod(np.concatenate([[1.0], np.arange(1.0, 16.0)]))
 
 
-def symmetric(closed: bool, spacing: float, covariance: Any, potential: Array) -> Array:
+def symmetric(closed: bool, spacing: float, covariance: Array, potential: Array) -> Array:
     """Return H (N, N) of v_t = (G v')' / 2 - V v = -H v, symmetric.
 
     Of a G that depends on the state, -(G v')' is D' G D v with the derivative D of the interpolant between the points: no
@@ -115,7 +121,6 @@ def symmetric(closed: bool, spacing: float, covariance: Any, potential: Array) -
 
     Args:
         closed: whether the grid goes around the circle.
-        spacing: its spacing.
         covariance: G, one number, or its values between the points: (N + 1,) half a spacing below and above each, (N,) below
             each on the circle.
         potential: V at the points (N,).
@@ -146,7 +151,7 @@ class Spectral:
     `rates` are lambda, `modes` U, `scale` s over the exponential of `top`, and `logs` its logarithms.
     """
 
-    def __init__(self, operator: Array, gauge: Array, scale: Any = 1.0, known: Spectral | None = None):
+    def __init__(self, operator: Array, gauge: Array, scale: Array | float = 1.0, known: Spectral | None = None):
         """Decompose H.
 
         Args:
@@ -193,14 +198,14 @@ FOURIER_TERMS = 80
 
 @dataclass(frozen=True, eq=False)
 class FourierOperator:
-    """L for G, one number or (N,), f (N,) and V, one number or (N,), or integrals over time of these; or its adjoint.
+    """L for G, one number or (N,), f (N,) and V (N,), or integrals over time of these; or its adjoint.
 
     `length` is that of the grid.
     """
 
-    covariance: Any
+    covariance: Array
     drift: Array
-    potential: Any
+    potential: Array
     length: float
     adjoint: bool = False
 

@@ -14,20 +14,18 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numba import float64, int64, types, void
-from numpy.typing import NDArray
 
+from zakai.numerics.arrays import Array, Number
 from zakai.numerics.compiled import kernel
 from zakai.numerics.line import window as lw
 from zakai.numerics.line.density import moments, support
 from zakai.numerics.line.grid_choice import DEPTH, LEVELS, MOST_CELLS
 from zakai.numerics.line.resolution import GROSS, RESOLVED
 from zakai.numerics.line.steps import exponent_added
-
-Array = NDArray[Any]
 
 _NOTHING = 1e-290
 
@@ -42,9 +40,9 @@ class Gaussian:
     observation: Callable[[Array], Array]
     value: Array
     precision: Array
-    constant: Any
+    constant: Number
     linear: bool = False
-    known: tuple[lw.Window, Array] | None = None  # h at the points of a grid
+    known: tuple[lw.Points, Array] | None = None  # h at the points of a grid
 
     def logs(self, points: Array) -> Array:
         """Return log l (J,), minus infinity where h has no value."""
@@ -84,7 +82,7 @@ class Product(NamedTuple):
     """
 
     values: Array
-    log_mass: Any
+    log_mass: Number
     depth: float
     growth: float
     window: lw.Window
@@ -95,8 +93,6 @@ def multiplied(values: Array, window: lw.Window, likelihood: Likelihood, rough: 
 
     Args:
         values: (N,) probabilities of the points of `window`.
-        window: the grid.
-        likelihood: the likelihood.
         rough: the largest spectrum at the highest frequencies, relative to the mass, with which the grid is kept.
     """
     product = _product(values, window, values, window, likelihood)
@@ -147,7 +143,7 @@ def _product(values: Array, window: lw.Window, new_values: Array, new: lw.Window
     return Product(*normalized(new_values, logs, np.ones(new.size), top_of_density), new)
 
 
-def normalized(density: Array, logs: Array, weights: Array, largest: float) -> tuple[Array, Any, float, float]:
+def normalized(density: Array, logs: Array, weights: Array, largest: float) -> tuple[Array, Number, float, float]:
     """Return the product of a density and a likelihood as probabilities.
 
     Args:
@@ -162,7 +158,7 @@ def normalized(density: Array, logs: Array, weights: Array, largest: float) -> t
     """
     if np.iscomplexobj(logs) or np.iscomplexobj(density):
         logs, density = logs.astype(complex), density.astype(complex)
-    result: tuple[Array, Any, float, float] = _normalized(*map(np.ascontiguousarray, (density, logs, weights)), largest)
+    result: tuple[Array, Number, float, float] = _normalized(*map(np.ascontiguousarray, (density, logs, weights)), largest)
     return result
 
 
@@ -173,7 +169,7 @@ _R, _C = types.float64, types.complex128
     types.Tuple((_R[::1], _R, _R, _R))(_R[::1], _R[::1], _R[::1], _R),  # type: ignore[no-untyped-call]
     types.Tuple((_C[::1], _C, _R, _R))(_C[::1], _C[::1], _R[::1], _R),  # type: ignore[no-untyped-call]
 )
-def _normalized(values: Array, logs: Array, weights: Array, largest: float) -> tuple[Array, Any, float, float]:
+def _normalized(values: Array, logs: Array, weights: Array, largest: float) -> tuple[Array, Number, float, float]:
     size = values.size
     result = np.zeros(size, values.dtype)
     own = np.empty(size)
@@ -220,7 +216,6 @@ def _surveyed(ends: Array, prior: Callable[[Array], Array], likelihood: Likeliho
     Args:
         ends: (J, 2).
         prior: logarithm of the density at offsets.
-        likelihood: the likelihood.
         origin: the point from which offsets count.
 
     Returns:
@@ -243,7 +238,6 @@ def place(offsets: Array, logs: Array, likelihood: Likelihood, origin: float) ->
     Args:
         offsets: points (N,) relative to the origin.
         logs: the logarithm of the density at these (N,).
-        likelihood: the likelihood.
         origin: the point from which offsets count.
     """
 
@@ -272,11 +266,11 @@ def place(offsets: Array, logs: Array, likelihood: Likelihood, origin: float) ->
 
 _V, _M = float64[::1], float64[:, ::1]
 
-PARTS = 16  # nodes of a spacing
+NODES_OF_SPACING = 16  # nodes of a spacing
 _WITHIN = 8  # places of which the mean is the value of a node
-REACH = 5  # spacings on both sides of a point
+SPLINE_REACH = 5  # spacings on both sides of a point
 WEAK_SHARE = 0.05  # of the tolerance that a sample may leave in the weak sense
-_POSITIONS = (np.arange(2 * REACH * PARTS) + 0.5) / PARTS - REACH
+_POSITIONS = (np.arange(2 * SPLINE_REACH * NODES_OF_SPACING) + 0.5) / NODES_OF_SPACING - SPLINE_REACH
 
 
 def _rule(order: int, derivative: int) -> Array:
@@ -293,9 +287,9 @@ _VALUES, _SLOPES, _OTHER = _rule(3, 0), _rule(3, 1), _rule(2, 0)
 
 def nodes(points: Array, spacing: float) -> Array:
     """Return where `at_nodes` needs the values of a function on a grid (N,)."""
-    count = (len(points) + 2 * REACH - 1) * PARTS + 2
-    first = points[0] - spacing * (REACH + 1.0 / PARTS)
-    return np.asarray(first + spacing / (PARTS * _WITHIN) * (np.arange(count * _WITHIN) + 0.5))
+    count = (len(points) + 2 * SPLINE_REACH - 1) * NODES_OF_SPACING + 2
+    first = points[0] - spacing * (SPLINE_REACH + 1.0 / NODES_OF_SPACING)
+    return np.asarray(first + spacing / (NODES_OF_SPACING * _WITHIN) * (np.arange(count * _WITHIN) + 0.5))
 
 
 def at_nodes(values: Array) -> Array:
@@ -307,7 +301,7 @@ def at_nodes(values: Array) -> Array:
 
 def weak(values: Array, spacing: float) -> tuple[Array, Array]:
     """Return a function and its derivative (N,) from values at the nodes."""
-    windows = np.lib.stride_tricks.sliding_window_view(values, len(_POSITIONS))[::PARTS]
+    windows = np.lib.stride_tricks.sliding_window_view(values, len(_POSITIONS))[::NODES_OF_SPACING]
     return windows @ _VALUES, windows @ _SLOPES / spacing
 
 
@@ -323,26 +317,26 @@ def weaken(fine: Array, start: int, precision: Array, observed: Array, centre: A
         b: receives the logarithms.
         change: receives the relative difference of another rule.
     """
-    m, size, length = fine.shape[0], b.size, (b.size + 2 * REACH - 1) * PARTS
+    m, size, length = fine.shape[0], b.size, (b.size + 2 * SPLINE_REACH - 1) * NODES_OF_SPACING
     h, logs = np.empty((m, length)), np.zeros(length)
     for i in range(m):
         for f in range(length):
-            h[i, f] = fine[i, start * PARTS + f]
+            h[i, f] = fine[i, start * NODES_OF_SPACING + f]
     exponent_added(h, centre, precision, observed, 1.0, 1.0, logs)
-    tops = np.empty(length // PARTS)
+    tops = np.empty(length // NODES_OF_SPACING)
     for cell in range(tops.size):
         tops[cell] = -np.inf
-        for f in range(cell * PARTS, (cell + 1) * PARTS):
+        for f in range(cell * NODES_OF_SPACING, (cell + 1) * NODES_OF_SPACING):
             tops[cell] = max(tops[cell], logs[f])
-        for f in range(cell * PARTS, (cell + 1) * PARTS):
+        for f in range(cell * NODES_OF_SPACING, (cell + 1) * NODES_OF_SPACING):
             logs[f] = np.exp(logs[f] - tops[cell])
     for j in range(size):
-        one, other, top = 0.0, 0.0, max(tops[j + REACH - 1], tops[j + REACH])
-        for cell in range(2 * REACH):
+        one, other, top = 0.0, 0.0, max(tops[j + SPLINE_REACH - 1], tops[j + SPLINE_REACH])
+        for cell in range(2 * SPLINE_REACH):
             here, there = 0.0, 0.0
-            for f in range(PARTS):
-                here += _VALUES[cell * PARTS + f] * logs[(j + cell) * PARTS + f]
-                there += _OTHER[cell * PARTS + f] * logs[(j + cell) * PARTS + f]
+            for f in range(NODES_OF_SPACING):
+                here += _VALUES[cell * NODES_OF_SPACING + f] * logs[(j + cell) * NODES_OF_SPACING + f]
+                there += _OTHER[cell * NODES_OF_SPACING + f] * logs[(j + cell) * NODES_OF_SPACING + f]
             scale = np.exp(min(tops[j + cell] - top, 600.0))
             one, other = one + scale * here, other + scale * there
         change[j] = 1.0
@@ -351,11 +345,11 @@ def weaken(fine: Array, start: int, precision: Array, observed: Array, centre: A
 
 
 @kernel(float64(_V, _V))
-def weak_error(now: Array, change: Array) -> float:
+def weak_error(density: Array, change: Array) -> float:
     """Return the change of mass, mean and variance, in deviations, by relative changes of a density."""
-    mean, variance = moments(now)[1:]
+    mean, variance = moments(density)[1:]
     mass, first, second = 0.0, 0.0, 0.0
-    for j in range(now.size):
-        at, part = (j - now.size // 2 - mean) / np.sqrt(variance), now[j] * change[j]
+    for j in range(density.size):
+        at, part = (j - density.size // 2 - mean) / np.sqrt(variance), density[j] * change[j]
         mass, first, second = mass + part, first + part * at, second + part * (at * at - 1.0)
     return abs(mass) + abs(first) + abs(second)

@@ -12,6 +12,7 @@ NEGLIGIBLE = 1e-13  # spectrum relative to the mass that need not be resolved
 SPECTRUM_FACTOR = 30.0  # times the spectrum that need not be resolved: more needs another grid
 SPECTRUM_SHARE = 1e-5  # of the tolerance that a transition may leave at the highest frequencies
 GROSS = 1e-4  # spectrum at the highest frequencies from which it is that of what a grid does not resolve, not of noise
+LOST_ALIASING = 0.1  # from which the density is lost
 RESOLVED = 1e-11  # spectrum, or Legendre coefficient, at the highest frequencies that is rounding
 EDGE = 1e-11  # density at the outermost points, relative to the maximum, that a grid may cut off
 EDGE_OF_ALIASING = 4.0  # spectra at the highest frequencies, whose waves reach the ends as well

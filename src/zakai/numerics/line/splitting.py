@@ -24,12 +24,12 @@ There the coefficients are complex: their imaginary parts are the derivatives, i
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numba import float64, int64, void
-from numpy.typing import NDArray
 
+from zakai.numerics.arrays import Array
 from zakai.numerics.compiled import helper, kernel
 from zakai.numerics.complex_step import STEP
 from zakai.numerics.exponentials import exponentiate
@@ -37,8 +37,6 @@ from zakai.numerics.line.averages import AVERAGES, EARLY, LATE, MEAN, MOST_MAGNU
 from zakai.numerics.line.density import highest_of, moments
 from zakai.numerics.line.gaussian_kernels import filtered, narrow_taps, taps_of, wrapped
 from zakai.numerics.line.steps import CELL, DRIFT, IMPOSSIBLE, OBSERVED, OVERFLOW, SLOPE, Coefficients, Transition, failed
-
-Array = NDArray[Any]
 
 MOST_SUBSTEPS = 64
 STEEPEST = 0.5  # change of exponents between points for which the filter of a narrow kernel is accurate
@@ -68,31 +66,30 @@ class Filtering(NamedTuple):
 
 @helper
 def divided(
-    now: Array, table: Array, c: Coefficients, averages: Array, spacing: float, closed: bool, varying: bool, accuracy: Accuracy
-) -> Transition:
+    density: Array, table: Array, c: Coefficients, averages: Array, spacing: float, closed: bool, varying: bool,
+    accuracy: Accuracy,
+) -> Transition:  # fmt: skip
     """Replace a density by that after a split interval, in as many averages and substeps as its error asks for.
 
     The samples of a Gaussian of the variance V, in squares of the spacing, are a filter of positive numbers with the relative
     error 2 exp(-2 pi^2 V).  Narrower kernels are used where these would need a spacing below `finest`.
 
     Args:
-        now: the density (N,).
+        density: the density (N,).
         table: see `steps.Grid`.
-        c: the coefficients of the interval.
         averages: the weights of `line/averages.py`.
-        spacing: the spacing of the grid.
         closed: whether it goes around the circle.
         varying: whether the coefficients vary within the interval.
         accuracy: what is asked of the result.
     """
-    size, at, (depth, most, finest) = now.size, highest_of(now), accuracy
-    begin, phi, drift = now.copy(), np.empty(size), np.empty(size)
+    size, at, (depth, most, finest) = density.size, highest_of(density), accuracy
+    begin, phi, drift = density.copy(), np.empty(size), np.empty(size)
     b, first, second = np.empty(size), np.empty(size), np.empty(size)
     magnus, substeps = 0.0, 1.0  # pairs of averages, one after the other, or the mean
     both, spreads = np.empty((3, 2, size if varying else 1)), np.empty(3)
     if varying:
         operators(table, c, averages[0], at, both, spreads)
-        mean_error, pair_error = averaging(now, both, spreads, spacing, closed)
+        mean_error, pair_error = averaging(density, both, spreads, spacing, closed)
         if mean_error > most:
             magnus = max(np.ceil(1.1 * (pair_error / most) ** 0.25), 1.0)
     for _ in range(8):
@@ -102,7 +99,7 @@ def divided(
         splitting, time, pairs, rounding, clipped, spread, constant, needed = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
         wide = np.log(1e4 * parts * substeps / most) / (2.0 * np.pi**2)
         for j in range(size):
-            now[j] = begin[j]
+            density[j] = begin[j]
         for i in range(2 * parts if magnus > 0.0 else 1):
             weights = averages[parts * (parts - 1) // 2 + i // 2]
             which = MEAN if magnus == 0.0 else (EARLY if i % 2 == 0 else LATE)
@@ -116,17 +113,17 @@ def divided(
                     return failed(spread, needed)
             differences(b, spacing, closed, first, second)
             filtering = Filtering(own_spread, shift, substeps, depth, needed > 0.0)
-            noise, end = split(now, phi, b, first, filtering, spacing, closed)
+            noise, end = split(density, phi, b, first, filtering, spacing, closed)
             if needed > 0.0 and not (noise < 1e-2 * most):  # perhaps the exponents vary too much between points
                 return failed(spread, max(needed, 0.6 * spacing))
-            splitting += residual(now, b, first, second, drift, own_spread, spacing, length) / substeps**4
+            splitting += residual(density, b, first, second, drift, own_spread, spacing, length) / substeps**4
             rounding, clipped, spread, constant = rounding + noise, max(clipped, end), spread + own_spread, constant + added
             if varying and (magnus == 0.0 or i % 2 == 1):
                 if parts > 1:
                     operators(table, c, weights, at, both, spreads)
-                mean_error, pair_error = averaging(now, both, spreads, spacing, closed)
+                mean_error, pair_error = averaging(density, both, spreads, spacing, closed)
                 time, pairs = time + (pair_error if magnus > 0.0 else mean_error), pairs + pair_error
-            total = moments(now)[0]
+            total = moments(density)[0]
             if not (1e-200 < total < 1e200):
                 splitting = np.inf
             if not (splitting < np.inf):
@@ -214,32 +211,32 @@ def residual(
 
 @helper
 def split(
-    now: Array, phi: Array, b: Array, first: Array, filtering: Filtering, spacing: float, closed: bool
+    density: Array, phi: Array, b: Array, first: Array, filtering: Filtering, spacing: float, closed: bool
 ) -> tuple[float, float]:
     """Replace a density by that after an average, in substeps; return the rounding error and what may have become zero.
 
     The filter of a narrow kernel is accurate where v is band-limited, that is where the exponents change little between points.
     """
     spread, shift, substeps, depth, narrow = filtering
-    size, count, weight, part = now.size, 2 * int(substeps), 1.0 / (6.0 * substeps), spread / (2.0 * substeps)
-    correction, negligible, clipped, steepest = spread / (72.0 * substeps**3), 1e-13 * now[highest_of(now)], 0.0, 0.0
+    size, count, weight, part = density.size, 2 * int(substeps), 1.0 / (6.0 * substeps), spread / (2.0 * substeps)
+    correction, negligible, clipped, steepest = spread / (72.0 * substeps**3), 1e-13 * density[highest_of(density)], 0.0, 0.0
     early, middle, joint, late, work = np.empty(size), np.empty(size), np.empty(size), np.empty(size), np.empty(size)
     for j in range(1, size):
         change = abs(phi[j] - phi[j - 1]) + 5.0 * weight * abs(b[j] - b[j - 1])
-        if now[j] > negligible:
+        if density[j] > negligible:
             steepest = max(steepest, change)
         if narrow and not (change < STEEPEST):
             for i in (j - 1, j):
-                if now[i] > negligible:
+                if density[i] > negligible:
                     return np.inf, 1.0
-                clipped, now[i] = max(clipped, now[i]), 0.0
+                clipped, density[i] = max(clipped, density[i]), 0.0
     for j in range(size):
         outer, gauge = weight * b[j], phi[j]
         if not (abs(gauge) < OVERFLOW and outer - gauge < OVERFLOW):
-            if now[j] > negligible or not (gauge < 0.0 or b[j] == IMPOSSIBLE):
+            if density[j] > negligible or not (gauge < 0.0 or b[j] == IMPOSSIBLE):
                 return np.inf, 1.0
-            clipped = max(clipped, now[j])
-            now[j], outer, gauge = 0.0, -OVERFLOW, 0.0
+            clipped = max(clipped, density[j])
+            density[j], outer, gauge = 0.0, -OVERFLOW, 0.0
         early[j], late[j], joint[j], work[j] = outer - gauge, outer + gauge, 2.0 * outer, gauge
         middle[j] = 4.0 * outer - correction * first[j] * first[j]
     for exponents in (early, middle, late):
@@ -251,7 +248,7 @@ def split(
     if substeps > 1.0:
         exponentiate(joint)
     for j in range(size):
-        now[j] *= early[j]
+        density[j] *= early[j]
     variance = part / (spacing * spacing)
     # Between exponentials of such a slope the kernel is as wide, about a mean that the slope displaces.
     taps = taps_of(variance, 0.5 * (np.sqrt(2.0 * depth) + steepest * np.sqrt(variance)) ** 2, size, narrow)
@@ -259,14 +256,14 @@ def split(
     for i in range(count):
         after = middle if i % 2 == 0 else (joint if i < count - 1 else late)
         if closed:
-            rounding += wrapped(now, work, shift / (count * spacing), variance, depth)
+            rounding += wrapped(density, work, shift / (count * spacing), variance, depth)
             for j in range(size):
-                now[j] *= after[j]
+                density[j] *= after[j]
         else:
             if i == count - 1:
                 for j in range(size):
                     work[j] = 1.0
-            noise, end = filtered(now, taps, after, work, narrow)
+            noise, end = filtered(density, taps, after, work, narrow)
             rounding, clipped = rounding + noise, max(clipped, end)
     return rounding, clipped
 

@@ -9,19 +9,17 @@ f, f' and h.  The functions of an interval are sums of terms with factors that d
 from __future__ import annotations
 
 from enum import Enum
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numba import float64, int64, types
-from numpy.typing import NDArray
 
+from zakai.numerics.arrays import Array
 from zakai.numerics.compiled import helper
 from zakai.numerics.exponentials import exponentiate
 from zakai.numerics.line.density import spectrum
 from zakai.numerics.line.grid_choice import FAR, log_likelihood
 from zakai.numerics.line.resolution import SPECTRUM_FACTOR
-
-Array = NDArray[Any]
 
 COLUMNS = (
     "gained", "mean", "variance", "aliasing", "edge", "negative", "time", "depth", "growth", "made", "error", "log_floor",
@@ -29,7 +27,7 @@ COLUMNS = (
 )  # fmt: skip
 # The transition: whole with a sample after it, split with increments inside, whole with increments inside, split with a sample.
 FACTOR, SPLIT, KERNEL, SPLIT_FACTOR = 0, 1, 2, 3
-MARGIN = 96  # points of a table of coefficients in time beyond the grid, of which a third may be used before it is made again
+TABLE_MARGIN = 96  # points of a table of coefficients in time beyond the grid; a third may be used before it is made again
 
 
 class Status(Enum):
@@ -282,13 +280,14 @@ _MOST_GROWTH = 1e80
 
 @helper
 def extent(
-    now: Array, ends: tuple[int, int], channel: Array, table: Array, c: Coefficients, middle: float, spacing: float, cut: float
-) -> tuple[float, float]:
+    density: Array, ends: tuple[int, int], channel: Array, table: Array, c: Coefficients, middle: float, spacing: float,
+    cut: float,
+) -> tuple[float, float]:  # fmt: skip
     """Return the range of points that a density occupies until it is after the transition, as if it were Gaussian.
 
     It is NaN where the density moves so far that the grid should move with it.
     """
-    half, by, tau, spread, (low, high) = now.size // 2, 0.0, c.length, c.covariances[0] * c.length, ends
+    half, by, tau, spread, (low, high) = density.size // 2, 0.0, c.length, c.covariances[0] * c.length, ends
     drifts = c.drifts[0]
     left, right = float(low - half), float(high - half)
     if np.isnan(channel[0]):
@@ -309,15 +308,15 @@ def extent(
 
 @helper
 def checked(
-    now: Array, ends: tuple[int, int], weak: bool, closed: bool, asked: Resolution, waves: tuple[Array, Array], answer: Array
+    density: Array, ends: tuple[int, int], weak: bool, closed: bool, asked: Resolution, waves: tuple[Array, Array], answer: Array
 ) -> tuple[int, float, float, float, float, float]:
     """Normalise a prediction that is accurate; return OK, its mass, aliasing, mass at the ends, negative mass, highest frequency.
 
     `answer` receives the support; where another grid is needed, its range in points and
     its spacing.
     """
-    size, (low, high), (positive, search, cut, negligible, spacing) = now.size, ends, asked
-    left, right, first, last, negative, aliasing, middle, highest, _ = spectrum(now, cut, negligible, *waves, search)
+    size, (low, high), (positive, search, cut, negligible, spacing) = density.size, ends, asked
+    left, right, first, last, negative, aliasing, middle, highest, _ = spectrum(density, cut, negligible, *waves, search)
     bound = max(100.0 * cut, 0.0 if positive else 4.0 * aliasing)
     edge = 0.0 if closed else max(left, right)
     if not positive:  # what is outside of the band is filtered too
@@ -333,12 +332,12 @@ def checked(
         answer[2] = spacing
     else:
         for j in range(size):
-            now[j] = max(now[j], 0.0)
-            mass += now[j]
+            density[j] = max(density[j], 0.0)
+            mass += density[j]
         if not (1e-200 < mass < 1e200):
             status = FAILED
         for j in range(size):
-            now[j] /= mass
+            density[j] /= mass
         answer[0], answer[1] = first, last
     return status, mass, aliasing, edge, negative, highest
 
@@ -362,7 +361,7 @@ def likelihood(h: Array, centre: Array, precision: Array, observed: Array, b: Ar
 
 
 @helper
-def product(now: Array, b: Array) -> tuple[float, float, float]:
+def product(density: Array, b: Array) -> tuple[float, float, float]:
     """Replace probabilities by their normalised product with exp(b).
 
     Returns:
@@ -370,26 +369,26 @@ def product(now: Array, b: Array) -> tuple[float, float, float]:
         grow; and the depth of the product below the maximum of the density, in nats.
     """
     largest, top, best, total, growth, depth = 0.0, 0, -np.inf, 0.0, 0.0, 0.0
-    logs = np.empty(now.size)
-    for j in range(now.size):
+    logs = np.empty(density.size)
+    for j in range(density.size):
         if not (b[j] > IMPOSSIBLE):
             b[j] = IMPOSSIBLE
-        largest = max(largest, now[j])
-        logs[j] = np.log(now[j]) if now[j] > 0 else -np.inf
+        largest = max(largest, density[j])
+        logs[j] = np.log(density[j]) if density[j] > 0 else -np.inf
         if logs[j] + b[j] > best:
             best, top = logs[j] + b[j], j
-    if not (best < np.inf and now[top] > _LEAST):
+    if not (best < np.inf and density[top] > _LEAST):
         return np.nan, growth, depth
-    reference, scale, factors = np.log(largest), 1.0 / now[top], np.empty(now.size)
-    for j in range(now.size):
+    reference, scale, factors = np.log(largest), 1.0 / density[top], np.empty(density.size)
+    for j in range(density.size):
         factors[j] = min(b[j] - b[top], OVERFLOW)
     exponentiate(factors)
-    for j in range(now.size):
+    for j in range(density.size):
         growth += factors[j]
-        now[j] = now[j] * scale * factors[j] if b[j] - b[top] < OVERFLOW else np.exp(logs[j] + b[j] - best)
-        total += now[j]
-    for j in range(now.size):
-        now[j] /= total
-        if now[j] > 0:
-            depth += now[j] * (reference - logs[j])
+        density[j] = density[j] * scale * factors[j] if b[j] - b[top] < OVERFLOW else np.exp(logs[j] + b[j] - best)
+        total += density[j]
+    for j in range(density.size):
+        density[j] /= total
+        if density[j] > 0:
+            depth += density[j] * (reference - logs[j])
     return np.log(total) + best, min(growth / total * largest * scale, _MOST_GROWTH), depth

@@ -13,23 +13,19 @@ term,
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numba import float64, void
-from numpy.typing import NDArray
 from scipy.special import erfc
 
+from zakai.numerics.arrays import Array
 from zakai.numerics.compiled import kernel
 from zakai.numerics.complex_step import STEP
 from zakai.numerics.line.modes import FALL
-from zakai.numerics.line.operator import FourierOperator, Spectral, derivatives, exponential_of, quotients
+from zakai.numerics.line.operator import FourierOperator, Generator, Spectral, derivatives, exponential_of, quotients
 from zakai.numerics.line.resolution import ROUNDING
 from zakai.numerics.line.window import CUT, SMALL, Window, density_at, gathered, interpolated, local_polynomial
-
-Array = NDArray[Any]
-
-Coefficients = tuple[Any, Array, Array | None]  # G, one number or (N,), f (N,) and V (N,), or integrals over time of these
 
 TERMS = 40
 PART = 3.0  # norm up to which one Taylor series is summed
@@ -39,12 +35,11 @@ _M = float64[:, ::1]
 
 
 def exponential_tangents(
-    window: Window, coefficients: Coefficients, changed: Sequence[Coefficients], values: Array, tangents: Array
+    window: Window, coefficients: Generator, changed: Sequence[Generator], values: Array, tangents: Array
 ) -> tuple[Array, Array]:
     """Return exp(L) u and its derivatives (p, N).
 
     Args:
-        window: the grid.
         coefficients: those of L.
         changed: the same at p parameters with infinitesimal imaginary parts.
         values: u (N,).
@@ -63,15 +58,15 @@ def exponential_tangents(
         return _by_complex_steps(window, changed, values, tangents)
     rows = np.zeros((3, 1 + len(changed), size))  # of G, f and V: the values, and their derivatives
     for row, scale, *parts in zip(rows, scales, coefficients, *changed, strict=True):
-        row[0] = 0.0 if parts[0] is None else scale * parts[0]
-        row[1:] = [np.zeros(size) if one is None else scale * np.imag(one) / STEP * np.ones(size) for one in parts[1:]]
+        row[0] = scale * parts[0]
+        row[1:] = [scale * np.imag(one) / STEP * np.ones(size) for one in parts[1:]]
     rows[2, 0] -= shift
     result = np.concatenate([values[None], tangents])
     _taylor(np.concatenate(derivatives(size, window.closed)), *rows, result, shift, norm)
     return result[0], result[1:]
 
 
-def _by_complex_steps(window: Window, changed: Sequence[Coefficients], values: Array, tangents: Array) -> tuple[Array, Array]:
+def _by_complex_steps(window: Window, changed: Sequence[Generator], values: Array, tangents: Array) -> tuple[Array, Array]:
     pairs = zip(changed, tangents, strict=True)
     after = np.array([exponential_of(window.generator(*one))(values + 1j * STEP * tangent)[0] for one, tangent in pairs])
     return after[0].real, after.imag / STEP

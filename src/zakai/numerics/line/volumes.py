@@ -12,17 +12,16 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numba import complex128, float64, int64
-from numpy.typing import NDArray
 
+from zakai.numerics.arrays import Array, Number
 from zakai.numerics.compiled import helper, kernel
 from zakai.numerics.line import window as lw
 from zakai.numerics.line.window import interpolated_logs
 
-Array = NDArray[Any]
 Bands = tuple[Array, Array, Array]
 
 _COUNTS = (1, 2, 3, 4, 6)  # steps of implicit Euler that are extrapolated
@@ -164,7 +163,7 @@ def ends_of_steps(length: float, first: float, count: int) -> Array:
     return np.concatenate([[0.0], first * (length / first) ** np.linspace(0.0, 1.0, count)])
 
 
-def advanced(bands: Callable[[Array], Bands], values: Array, ends: Array, backward: bool = False) -> tuple[Array, Any]:
+def advanced(bands: Callable[[Array], Bands], values: Array, ends: Array, backward: bool = False) -> tuple[Array, Number]:
     """Return the masses after steps, with the sum one, and the logarithm of their sum before.
 
     Args:
@@ -174,7 +173,7 @@ def advanced(bands: Callable[[Array], Bands], values: Array, ends: Array, backwa
         ends: the ends of the steps (T + 1,), with the start.
         backward: whether to take the adjoint.
     """
-    gained: Any = 0.0
+    gained: Number = 0.0
     steps = list(zip(ends[:-1], ends[1:], strict=True))
     for start, stop in steps[::-1] if backward else steps:
         below, diagonal, above = bands(start + (stop - start) * _TIMES)

@@ -9,17 +9,15 @@ rounding.  Logarithms and messages are interpolated by polynomials through the n
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from zakai.numerics.arrays import Array
 from zakai.numerics.complex_step import angle, is_complex, real_product
 from zakai.numerics.line.density import spectrum, spectrum_of_many, waves
 from zakai.numerics.line.operator import FourierOperator, generator
 from zakai.numerics.line.resolution import NEGLIGIBLE, SPECTRUM_FACTOR
-
-Array = NDArray[Any]
 
 _STENCIL = np.arange(-3, 5)
 STENCIL_WEIGHTS = np.array([1.0 / np.prod([float(i - j) for j in _STENCIL if j != i]) for i in _STENCIL])
@@ -64,8 +62,27 @@ LARGE = 1024  # points of a grid on which matrices propagate messages, and kerne
 CUT = 1e-13  # density relative to its maximum that a new grid must hold
 DEEP = 1e-20  # the same of densities whose small values are accurate
 SMALL = 1e-8  # density relative to its maximum below which its logarithm is interpolated
-TOGETHER = 256  # points at which values of a large grid are interpolated together
+POINTS_TOGETHER = 256  # points at which values of a large grid are interpolated together
 ALIGNMENT = 8  # centres are at multiples of so many spacings
+
+
+class Points(Protocol):
+    """Points that carry a density: those of a uniform grid, of cells, or of Gauss-Lobatto elements."""
+
+    @property
+    def origin(self) -> float:
+        """The state from which offsets count."""
+
+    @property
+    def closed(self) -> bool:
+        """Whether they go once around the circle."""
+
+    @property
+    def points(self) -> Array:
+        """The points, first those that carry probabilities."""
+
+    def __hash__(self) -> int:
+        """Equal points have equal tables."""
 
 
 class Window(NamedTuple):
@@ -91,10 +108,10 @@ class Window(NamedTuple):
         """The points (size,)."""
         return self.origin + self.offsets
 
-    def generator(self, covariance: Any, drift: Array, potential: Array | None = None) -> Operator:
+    def generator(self, covariance: Array, drift: Array, potential: Array) -> Operator:
         """Return the Kolmogorov operator L for G, f and V at the points, or integrals over time of these."""
         if self.size > LARGEST:
-            return FourierOperator(covariance, drift, 0.0 if potential is None else potential, self.spacing * self.size)
+            return FourierOperator(covariance, drift, potential, self.spacing * self.size)
         return generator(self.closed, self.spacing, covariance, drift, potential)
 
 
@@ -178,8 +195,7 @@ def fitted(check: GridCheck, window: Window, most: int = LARGEST, generous: int 
     """Return the grid to go on with: the same where it serves, else one that fits the density.
 
     Args:
-        look: the figures of the density.
-        window: its grid.
+        check: the figures of the density.
         most: the largest size.
         generous: a grid of up to so many points is kept though fewer would do.
         margin: range of a new grid beyond that of the density, relative to it.
@@ -235,8 +251,8 @@ def refined(window: Window, factor: float = 2**0.5) -> Window:
 
 def interpolated(values: Array, window: Window, offsets: Array) -> Array:
     """Return the interpolants of values (..., N) at offsets (J,) from the origin."""
-    if len(offsets) > TOGETHER and window.size > LARGE:
-        parts = np.array_split(offsets, -(-len(offsets) // TOGETHER))
+    if len(offsets) > POINTS_TOGETHER and window.size > LARGE:
+        parts = np.array_split(offsets, -(-len(offsets) // POINTS_TOGETHER))
         return np.concatenate([interpolated(values, window, part) for part in parts], axis=-1)
     at = (offsets - window.centre) / window.spacing + window.size // 2
     nearest = np.round(at)

@@ -16,7 +16,7 @@ from zakai.numerics.compiled import helper, kernel
 from zakai.numerics.formula_kernel import BLOCK
 from zakai.numerics.particles.formulas import BOX, F1, F2, F3, PROGRAM, block_of, load_point, run_program
 from zakai.numerics.particles.motion import EVENTS, MOTION, buffers_of, run_event
-from zakai.numerics.small_matrices import multiply
+from zakai.numerics.small_matrices import assign, multiply
 
 Array = Any
 _SERIES = 4.0  # norm of A times the length up to which Q is a series; twice as long by halves
@@ -97,10 +97,10 @@ def noise_about(A: Array, G: Array, length: float, out: Array) -> None:
     while norm > _SERIES and halves < 60:
         norm, halves = 0.5 * norm, halves + 1
     own = length / 2.0**halves
-    term, product, factor = G.copy(), np.empty((n, n)), own
+    term, product, factor = np.empty((n, n)), np.empty((n, n)), own
     for i in range(n):
         for j in range(n):
-            out[i, j] = own * G[i, j]
+            term[i, j], out[i, j] = G[i, j], own * G[i, j]
     for k in range(1, 40):
         multiply(product, A, term)
         factor = factor * 0.5 * own / (k + 1)
@@ -127,9 +127,9 @@ def noise_about(A: Array, G: Array, length: float, out: Array) -> None:
                 for j in range(n):
                     out[i, j] = term[i, j] + other[i, j]
             multiply(product, back, back)
-            back[:] = product
+            assign(back, product)
             multiply(product, ahead, ahead)
-            ahead[:] = product
+            assign(ahead, product)
     for i in range(n):
         for j in range(i):
             out[i, j] = out[j, i] = 0.5 * (out[i, j] + out[j, i])
@@ -213,7 +213,7 @@ def kick_roots(motion: Any, events: Any, A: Array, length: float, about: Array, 
             continue
         slope = slopes[j]
         if A.size:
-            slope[:] = A
+            assign(slope, A)
         else:
             for d in range(n):
                 at[d] = x[d, 0]

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from zakai.numerics.quasi_random import quasi_random
 from zakai.numerics.trains.grid import Grid, after_noise, kernel_matrix, padded_prefilter
 from zakai.numerics.trains.kernels import add_train, draw, values_on_grid
 
@@ -23,14 +24,6 @@ def tail_radius(n: int, share: float) -> float:
     from scipy.stats import chi2
 
     return float(chi2.isf(share, n))
-
-
-@lru_cache(maxsize=8)
-def quasi_random(count: int, n: int) -> Array:
-    """Return points of a fixed Sobol sequence in the unit cube (n, count): draws are a function of the density alone."""
-    from scipy.stats import qmc
-
-    return np.ascontiguousarray(qmc.Sobol(n, scramble=True, rng=np.random.default_rng(1)).random(count).T)
 
 
 @dataclass(frozen=True, eq=False)
@@ -202,14 +195,29 @@ class Train:
         Half are draws, half draws of conditional laws in proportion to their square roots, weighted as draws of the mixture:
         parts with little mass, and tails, have points too.
         """
+        x, likely, drawn = self._proposed(count)
+        # The square roots of an axis with no mass are drawn nowhere; both probabilities are zero there.
+        weights = likely / np.maximum(0.5 * likely + 0.5 * drawn, 1e-300)
+        weights = weights / weights.sum()
+        return self._with_moments(x, weights), weights
+
+    def quadrature(self, count: int) -> tuple[Array, Array]:
+        """Return points (n, P) with weights (P,), sums over which are integrals of the normalised train; `count` is even.
+
+        The points are those of `cloud`, weighted by the values of the train where they are, not by the masses of the cells.
+        """
+        x, likely, drawn = self._proposed(count)
+        weights = np.maximum(self.evaluate(x), 0.0) / np.maximum(likely + drawn, 1e-300)
+        weights = weights / weights.sum()
+        return self._with_moments(x, weights), weights
+
+    def _proposed(self, count: int) -> tuple[Array, Array, Array]:
+        """Return draws x (n, P), half by each law of `draw`, and their probabilities (P,) in both."""
         share = quasi_random(count, self.grid.n)
         plain, p = self.drawn(np.ascontiguousarray(share[:, : count // 2]), False)
         wide, q = self.drawn(np.ascontiguousarray(share[:, count // 2 :]), True)
         likely, drawn = np.concatenate([p, q], axis=1)
-        # The square roots of an axis with no mass are drawn nowhere; both probabilities are zero there.
-        weights = likely / np.maximum(0.5 * likely + 0.5 * drawn, 1e-300)
-        weights = weights / weights.sum()
-        return self._with_moments(np.concatenate([plain, wide], axis=1), weights), weights
+        return np.concatenate([plain, wide], axis=1), likely, drawn
 
     def _with_moments(self, x: Array, weights: Array) -> Array:
         """Return points (n, P) after the affine map, near the identity, that gives them the moments of the train.

@@ -202,13 +202,13 @@ export class Data {
 
   /** Say what the record holds, and filter it if that is wanted; null where a newer description does both. */
   async _describe() {
-    const told = await this._told();
-    if (told && this.wanted) this.studio.run();
-    if (told !== null) this.wanted = false;
-    return told;
+    const done = await this._described();
+    if (done && this.wanted) this.studio.run();
+    if (done !== null) this.wanted = false;
+    return done;
   }
 
-  async _told() {
+  async _described() {
     const { studio } = this, { text, data } = studio.state;
     if (!studio.model || (data.kind === "file" && !data.file)) return false;
     if (data.kind === "file" && data.columns && data.inputs) {
