@@ -31,8 +31,8 @@ class Error(NamedTuple):
     """The relative error of a density as a quadratic function, and what chance adds to the error of its mean.
 
     In coordinates z in which the density has mean zero and the covariance one, the error has the gradient `first` (n,) and the
-    second derivatives `second` (n, n), in the mean.  So the mean is off by `first`, and by an error of mean zero with the
-    covariance `spread` (n, n).
+    second derivatives `second` (n, n), in the mean.  So the mean is off by `first` and the covariance by `second`.  What chance
+    adds to the error of the mean has the covariance `spread` (n, n).
     """
 
     first: Array
@@ -71,9 +71,12 @@ class Error(NamedTuple):
         """Return the same function where an observation has moved the mean to z = shift, with the covariance B B'."""
         return Error(B.T @ (self.first + self.second @ shift), B.T @ self.second @ B, B.T @ self.spread @ B)
 
-    def of_mean(self, root: Array) -> Array:
-        """Return the mean square (n, n) of the error of the mean of a density with the covariance root root'."""
-        return np.asarray(root @ (np.outer(self.first, self.first) + self.spread) @ root.T)
+    def in_deviations(self, root: Array) -> float:
+        """Return the largest error of a mean or a deviation, in deviations, where the covariance is root root'."""
+        square = np.outer(self.first, self.first) + self.spread
+        variances, means, changes = (np.diag(root @ part @ root.T) for part in (np.eye(len(root)), square, self.second))
+        variances = np.maximum(variances, 1e-300)
+        return float(np.maximum(np.sqrt(np.maximum(means, 0.0) / variances), 0.5 * np.abs(changes) / variances).max())
 
 
 @dataclass(frozen=True)
@@ -118,8 +121,7 @@ class Missed:
         found = Error(parts.sum(axis=1), parts @ z.T, parts @ parts.T)
         if few:
             found = found.seen(np.linalg.solve(root_of(P), root_of(cov)), np.zeros(n))
-        root = root_of(cov)
-        size, most = in_deviations(found.of_mean(root), cov), MOST * self.size
+        size, most = found.in_deviations(root_of(cov)), MOST * self.size
         return found.scaled(min(1.0, most / max(size, 1e-300)))
 
 
@@ -127,8 +129,3 @@ def root_of(P: Array) -> Array:
     """Return the Cholesky factor (n, n) of a covariance, with the accuracy of rounding."""
     scale = np.maximum(np.sqrt(np.diag(P)), 1e-300)
     return np.asarray(scale[:, None] * np.linalg.cholesky(P / np.outer(scale, scale) + 1e-9 * np.eye(len(P))))
-
-
-def in_deviations(error: Array, cov: Array) -> float:
-    """Return the largest error of a mean in standard deviations, of covariances (n, n)."""
-    return float(np.sqrt(np.max(np.diag(error) / np.maximum(np.diag(cov), 1e-300))))

@@ -19,7 +19,7 @@ from zakai.methods._protocol import Info
 from zakai.methods.frame import again
 from zakai.methods.frame.build import Builder
 from zakai.methods.frame.chain import MOST_SUBSTEPS, Chain, Prediction, extrapolated
-from zakai.methods.frame.errors import Error, in_deviations, root_of
+from zakai.methods.frame.errors import Error, root_of
 from zakai.methods.frame.moves import Shift
 from zakai.methods.frame.placement import Mass
 from zakai.methods.frame.state import Choice, Control, Made, Prepared, State, Substeps
@@ -217,7 +217,7 @@ def _step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[tupl
     errors = control.error.along(np.linalg.solve(root, prediction.slope @ before))
     errors = errors.seen(np.linalg.solve(root, after), np.linalg.solve(root, shift)).plus(own)
     errors = errors.plus(Error.by_chance(len(mean), new))
-    error = in_deviations(errors.of_mean(after), cov)
+    error = errors.in_deviations(after)
     health = {
         "error_estimate": error,
         "tolerance_ratio": error / (WITHIN * prepared.tolerance),
@@ -238,8 +238,7 @@ def _step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[tupl
 
 def error_of(prepared: Prepared, state: State) -> float:
     """Return the estimated error of the mean of a state, in standard deviations."""
-    P = state.train(prepared.system.periods).moments()[1]
-    return in_deviations(state.control.error.of_mean(root_of(P)), P)
+    return state.control.error.in_deviations(root_of(state.train(prepared.system.periods).moments()[1]))
 
 
 def builder_of(prepared: Prepared, state: State) -> Builder:
@@ -294,7 +293,10 @@ def _predicted(chain: Chain, state: State, likelihood: Likelihood) -> Predicted:
         if count <= 2 * wanted <= 4 * count:
             break
         count = wanted
-    prediction, count = chain.first(u, wanted)
+    try:
+        prediction, count = chain.first(u, wanted)
+    except (Unresolved, np.linalg.LinAlgError):  # where a part of the density reaches infinity, fewer substeps hold the rest
+        prediction, count = chain.first(u, 1)
     time = Substeps(both if extrapolate else plain, length)
     gain = 1.0
     if extrapolate:
