@@ -291,8 +291,9 @@ def test_the_gradient_of_the_log_likelihood_is_its_slope(name):
     value, gradient = function.value_and_gradient(model.theta())
     assert value == pytest.approx(zakai.filter(model, record, "general-direct").log_likelihood, abs=1e-12)
     for i, h in enumerate(np.eye(len(gradient)) * 1e-6):
-        slope = (function(model.theta() + h) - function(model.theta() - h)) / 2e-6
-        # The grid on which a density prior is cut moves with the parameters in differences alone.
+        # The grid on which a density prior is cut moves with the parameters in differences alone, and may jump in one of them.
+        places = [model.theta() + k * h for k in (-8, -4, 0, 4, 8)]
+        slope = np.median([(function(theta + h) - function(theta - h)) / 2e-6 for theta in places])
         assert gradient[i] == pytest.approx(slope, rel=1e-4 if name == "density" else 1e-6, abs=1e-7)
 
 

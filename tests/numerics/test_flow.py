@@ -152,9 +152,12 @@ def test_two_intervals_compose_to_one_of_any_length():
 def test_the_units_of_the_state_and_of_time_do_not_matter():
     scale = np.array([1e6, 1e-6, 1.0])
     own, other = (integrate(system(3, True, 9.0, s), [0.0], [0.8], False).transition for s in (None, scale))
-    assert other.map[0] / (scale[:, None] / scale) == pytest.approx(own.map[0], rel=1e-11)
-    assert other.noise[0] / (scale[:, None] * scale) == pytest.approx(own.noise[0], rel=1e-11)
-    assert other.information[0] * (scale[:, None] * scale) == pytest.approx(own.information[0], rel=1e-11)
+    for found, expected in (
+        (other.map[0] / (scale[:, None] / scale), own.map[0]),
+        (other.noise[0] / (scale[:, None] * scale), own.noise[0]),
+        (other.information[0] * (scale[:, None] * scale), own.information[0]),
+    ):
+        assert found == pytest.approx(expected, rel=1e-11, abs=1e-11 * np.abs(expected).max())
     assert other.constant[0] == pytest.approx(own.constant[0], rel=1e-11)
 
 

@@ -63,6 +63,7 @@ ADVICE = {
     "tolerance_ratio": f"{_MORE_OBSERVATIONS}, or a larger tolerance (command: --option tolerance=...)",
     "tail_depth": "check that observation and its noise",
     "aliasing": _COMPARE,
+    "off_grid_error": f"raise most_rank, or {_COMPARE}",
     "splitting_error": _COMPARE,
     "outside_tables": "extend the table",
     "unknown_draws": "compare with the method guided-particles",

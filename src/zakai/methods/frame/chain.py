@@ -28,7 +28,7 @@ from zakai.methods.frame.placement import Mass, closed_axes
 from zakai.methods.frame.state import Half, Prepared
 from zakai.methods.frame.unresolved import Unresolved
 from zakai.methods.frame.weak_points import WeakPoints, along_closed_axes, shifted
-from zakai.methods.particles.interval import Interval
+from zakai.methods.particles.events import Interval
 from zakai.methods.particles.programs import Array
 from zakai.numerics.trains.carried import Carried, Likelihood, Term
 from zakai.numerics.trains.train import Train

@@ -22,8 +22,9 @@ from typing import Any
 import numpy as np
 import sympy as sp
 
-from zakai.methods.particles.interval import Interval, noise_about_middle
+from zakai.methods.particles.events import Interval
 from zakai.methods.particles.interval import Motion as Coefficients
+from zakai.methods.particles.interval import noise_about_middle
 from zakai.methods.particles.programs import Array, Expressions
 from zakai.methods.particles.system import root
 from zakai.methods.particles.system import system_of as formulas_of

@@ -10,7 +10,7 @@ import numpy as np
 
 from zakai.methods.frame.errors import Error
 from zakai.methods.frame.motion import Motion, System
-from zakai.methods.particles.interval import Interval
+from zakai.methods.particles.events import Interval
 from zakai.methods.particles.programs import Array
 from zakai.models.model import Model
 from zakai.numerics.trains.cross import Options

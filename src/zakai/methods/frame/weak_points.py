@@ -17,7 +17,7 @@ import numpy as np
 from zakai.methods.frame.build import Builder
 from zakai.methods.frame.placement import Mass
 from zakai.methods.frame.unresolved import Unresolved
-from zakai.methods.particles.interval import Interval
+from zakai.methods.particles.events import Interval
 from zakai.methods.particles.programs import Array
 from zakai.numerics.trains.carried import Carried, Path, Term
 

@@ -24,8 +24,9 @@ import numpy as np
 from zakai.densities import ParticleDensity
 from zakai.methods._protocol import Backward, Info
 from zakai.methods.particles.descent import Descent, Piece, families
+from zakai.methods.particles.events import Events
 from zakai.methods.particles.filter import MOVE_CONTROL
-from zakai.methods.particles.interval import Events, Scheme
+from zakai.methods.particles.interval import Scheme
 from zakai.methods.particles.moments import moments
 from zakai.methods.particles.programs import Array
 from zakai.methods.particles.state import Prepared, State

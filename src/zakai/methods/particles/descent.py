@@ -11,7 +11,8 @@ from typing import NamedTuple
 import numpy as np
 
 from zakai.methods.particles.errors import Genealogy
-from zakai.methods.particles.interval import Events, Motion
+from zakai.methods.particles.events import Events
+from zakai.methods.particles.interval import Motion
 from zakai.methods.particles.programs import Array
 from zakai.methods.particles.window import Window, taken
 from zakai.numerics.particles.population import DEPTH

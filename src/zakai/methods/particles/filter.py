@@ -22,20 +22,17 @@ import numpy as np
 
 from zakai.methods._protocol import Info
 from zakai.methods.particles.errors import CAUTION, FEW_FAMILIES, Genealogy, of_log_likelihood, variances
+from zakai.methods.particles.events import Events, Interval, Observed, with_update
 from zakai.methods.particles.interval import (
     MOST_SUBSTEPS,
     MOST_TIME_ERROR,
     OF_RANDOM_ERROR,
     PILOTS,
     TIME_ERROR,
-    Events,
-    Interval,
-    Observed,
     Pilots,
     Scheme,
     Steps,
     steps_of,
-    with_update,
 )
 from zakai.methods.particles.moments import moments_of
 from zakai.methods.particles.programs import Array

@@ -9,7 +9,8 @@ from typing import NamedTuple
 import numpy as np
 
 from zakai.methods.particles.errors import Genealogy
-from zakai.methods.particles.interval import Interval, Motion
+from zakai.methods.particles.events import Interval
+from zakai.methods.particles.interval import Motion
 from zakai.methods.particles.programs import Array
 from zakai.methods.particles.system import System, system_of
 from zakai.methods.particles.window import Window, taken

@@ -11,7 +11,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zakai.methods.particles.interval import Events, Motion, Observed
+from zakai.methods.particles.events import Events, Observed
+from zakai.methods.particles.interval import Motion
 from zakai.methods.particles.programs import Array
 from zakai.methods.particles.system import root
 from zakai.numerics.particles import moves
