@@ -191,3 +191,15 @@ def test_a_drift_with_kinks_that_contracts_a_broad_prior(drift):
         deviation = np.sqrt(p @ (x - p @ x) ** 2)
         assert abs(result.mean[k, 0] - p @ x) < 2e-3 * deviation
         assert abs(np.sqrt(result.variance[k, 0]) / deviation - 1.0) < 2e-3
+
+
+def test_a_jump_of_the_drift_where_the_sensor_jumps_is_one():
+    def filtered(place):
+        model = zakai.Model(
+            state=["x"], drift=[f"-0.8*sign(x - {place})"], diffusion=[[0.7]], observation=["floor(2*x)/2"],
+            observation_kind="samples", observation_noise=[[0.04]], prior={"kind": "gaussian", "mean": [0.3], "cov": [[1.5]]},
+        )  # fmt: skip
+        return zakai.filter(model, zakai.Record([0.3, 0.6, 1.0, 1.5], [[0.5], [0.02], [0.48], [np.nan]], "samples"))
+
+    one, other = filtered(0), filtered(1e-5)
+    assert np.isfinite(one.mean).all() and np.abs(one.mean - other.mean).max() < 1e-4

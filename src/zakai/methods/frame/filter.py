@@ -41,7 +41,7 @@ BEYOND = 0.3  # error of a mean over the distance of an observation, where a Gau
 OF_MEAN = 0.6  # error of a mean over what a motion loses of the mass and what is near an edge
 DEEP, SHARPEST = 2.0, 0.03  # depth in nats from which a prediction has a smaller tolerance, and the least factor of it
 UNKNOWN = 1e3  # deviations of an error of which nothing is known
-WITHIN = 2.0  # tolerances of an estimate that goes without a warning: errors are up to twice as large
+WITHIN = 3.0  # tolerances that the error of a mean may reach
 FIGURES = (
     "error_estimate", "tolerance_ratio", "rank", "mass_defect", "off_grid_error", "edge_mass", "tail_depth", "powers",
     "substeps", "time_error", "effective_share",

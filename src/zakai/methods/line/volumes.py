@@ -31,6 +31,7 @@ FIRST = 0.1  # of the time in which the drift would cross the range of the densi
 FASTEST = 100.0  # ranges of the density in the interval, divided by the tolerance: a faster drift counts as this
 KINK_PROBES = 1025  # points between which kinks are sought
 MOST_KINKS = 16
+ONE_KINK = 1e-10  # distance, of the interval, of the kinks of two coefficients that are one
 PROBES = 65  # points between which a formula ceases to have values
 DIFFUSED = 0.5  # of the time in which noise would double the variance: the first step
 GENTLE = 0.25  # of the steps where the density does not contract much
@@ -167,7 +168,8 @@ def kinks_between(prepared: Prepared, lower: float, upper: float, t: float) -> A
         middle = 0.5 * (low + high)
         same = (kinks(middle[:, None], t, theta)[np.arange(len(at)), which] < 0) == left
         low, high = np.where(same, middle, low), np.where(same, high, middle)
-    return np.sort(0.5 * (low + high))
+    found = np.sort(0.5 * (low + high))
+    return found[np.diff(found, prepend=-np.inf) > ONE_KINK * (upper - lower)]
 
 
 class FlowSummary(NamedTuple):
