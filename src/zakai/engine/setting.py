@@ -18,8 +18,8 @@ from zakai.numerics.one_thread import one_thread
 from zakai.records.schedule import Schedule
 
 _ENDS = (
-    "in two or more states the density must vanish before the ends of the domain, and have a value beyond them; take the logarithm "
-    "of a positive state as the state, or guided-particles"
+    "in two or more states the density must vanish before the ends of the domain, and have a value beyond them; take the "
+    "logarithm of a positive state as the state, or guided-particles"
 )
 KEPT = 8  # schedules whose preparation is kept for each model
 
