@@ -12,7 +12,6 @@ RULE = "#d9dde2"
 BAND_COLOUR = "#3b5f86"
 TRUTH_COLOUR = "#d55e00"
 SERIES_COLOUR = "#2f75ad"
-SANS = "system-ui, -apple-system, 'Segoe UI', Roboto, 'Helvetica Neue', Arial, sans-serif"
 
 
 def css() -> str:

@@ -49,11 +49,6 @@ class Error(NamedTuple):
         """Return an error of the mean of so many deviations, in a direction that is not known."""
         return cls.zero(n)._replace(spread=error**2 * np.eye(n))
 
-    @property
-    def size(self) -> float:
-        """The root mean square of the quadratic function over a Gaussian."""
-        return float(np.sqrt(self.first @ self.first + 0.5 * np.sum(self.second**2)))
-
     def plus(self, other: Error, factor: float = 1.0) -> Error:
         """Return the sum with an error times a factor; what chance adds is independent."""
         first, second = self.first + factor * other.first, self.second + factor * other.second

@@ -23,7 +23,6 @@ Array = Any
 Coefficients = Callable[[Array, Any], tuple[Array, Array]]
 
 RARE = 1e-3  # share of paths that may escape: the error of a density without them is about that, and is reported
-RARE_PATHS = 1e-2  # the same for several states, whose error may be a hundred times as large
 FAR = 10.0 ** np.arange(1, 10)  # distances at which the growth of the drift is seen
 FASTER = 2.0  # ratio of d log |x| / dt there and nearby from which it may grow without limit
 REACH = 8.0  # standard deviations, of the density and of the noise, that no path leaves
