@@ -17,6 +17,8 @@ CACHE_BYTES = 96 * 2**20  # of tables and decompositions of grids, which are sto
 class Derived(Enum):
     """What is derived of a model on a grid, and held in the cache."""
 
+    __hash__ = object.__hash__  # that of an enumeration hashes the name each time
+
     TABLES = "f, h and G at the points of a grid"
     MODES = "the decomposition of the operator on a grid"
     MESSAGE_MODES = "the decomposition of the operator of messages on a grid"

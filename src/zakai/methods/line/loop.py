@@ -186,8 +186,38 @@ def infos_of(prepared: Prepared, pieces: Sequence[Piece]) -> Infos:
 
 def one(prepared: Prepared, k: int, state: State, observed: np.ndarray) -> tuple[State, Info] | None:
     """Return the state after interval k, and its report; None where the loop does not take it."""
+    if prepared.gaussian and not prepared.cut_up:
+        segment = _single(prepared, k, state, observed)
+        if segment is not None:
+            return segment
     pieces = compiled_steps(prepared, slice(k, k + 1), state, observed[None])
-    return (pieces[0].last, _info(prepared, pieces[0])) if pieces else None
+    if not pieces:
+        return None
+    first = pieces[0]
+    place = first.before.origin, float(first.centres[0]), float(first.spacings[0])
+    return first.last, _info(prepared, k, first.last, place, first.reports[0])
+
+
+def _single(prepared: Prepared, k: int, state: State, observed: np.ndarray) -> tuple[State, Info] | None:
+    """Return the state after interval k, and its report, where the grid of the state serves; None where another is needed."""
+    window, size = state.window, len(state.values)
+    if size > prepared.largest or misses_drift(prepared, window):
+        return None
+    grid = grid_of(prepared, window, slice(k, k + 1))
+    if grid is None:
+        return None
+    start = Start(np.ascontiguousarray(state.values), float(state.error), float(state.log_floor))
+    observed = np.ascontiguousarray(observed[None], float)
+    segment = advance(prepared.mechanisms, start, grid, prepared.steps, k, observed, prepared.limits)
+    if not len(segment.reports):
+        return None
+    report, origin, spacing = segment.reports[0], state.origin, float(state.spacing)
+    centre = spacing * (round(state.centre / spacing) + (float(report[START]) - grid.start))
+    error, log_floor = float(report[ERROR]), float(report[FLOOR])
+    state = State(segment.densities[0], origin, centre, spacing, state.unit, state.closed, error, log_floor)
+    if segment.status == Status.AFTER:
+        state = regridded(prepared, state)
+    return state, _info(prepared, k, state, (origin, centre, spacing), report)
 
 
 def compiled_steps(prepared: Prepared, rows: slice, state: State, observed: np.ndarray) -> list[Piece]:
@@ -286,32 +316,34 @@ def _infos(prepared: Prepared, piece: Piece) -> Infos:
     def each(function: Callable[[State, float], Any]) -> np.ndarray:
         return np.array([function(*pair) for pair in zip(states, stops)])
 
-    columns = dict(zip(COLUMNS, piece.reports.T)) | {"centre": piece.centres, "spacing": piece.spacings}
-    mean, variance, health = _report(prepared, piece, columns, each)
+    columns, origin = dict(zip(COLUMNS, piece.reports.T)), piece.before.origin
+    mean, variance, health = _report(prepared, (origin, piece.centres, piece.spacings), columns, each)
     return Infos(columns["gained"], mean[:, None], variance[:, None, None], health)
 
 
-def _info(prepared: Prepared, piece: Piece) -> Info:
-    """Return the report of a single step."""
+def _info(prepared: Prepared, k: int, state: State, place: Place, report: Array) -> Info:
+    """Return the report of interval k, after which the state is this one."""
 
     def each(function: Callable[[State, float], Any]) -> np.ndarray:
-        return np.asarray(function(piece.states[0], float(prepared.schedule.stops[piece.first])))
+        return np.asarray(function(state, float(prepared.schedule.stops[k])))
 
-    columns = dict(zip(COLUMNS, piece.reports[0].tolist()))
-    columns |= {"centre": float(piece.centres[0]), "spacing": float(piece.spacings[0])}
-    mean, variance, health = _report(prepared, piece, columns, each)
+    columns = dict(zip(COLUMNS, report.tolist()))
+    mean, variance, health = _report(prepared, place, columns, each)
     return Info(columns["gained"], np.array([mean]), np.array([[variance]]), health)
 
 
+Place = tuple[Any, Any, Any]  # the origin, the centres and the spacings of the grids of steps
+
+
 def _report(
-    prepared: Prepared, piece: Piece, columns: Mapping[str, Any], each: Callable[[Callable[[State, float], Any]], np.ndarray]
+    prepared: Prepared, place: Place, columns: Mapping[str, Any], each: Callable[[Callable[[State, float], Any]], np.ndarray]
 ) -> tuple[Any, Any, dict[str, Any]]:
     """Return the mean, the variance and the health figures of steps, as arrays (K,), or as the numbers of a single one.
 
     `each` applies a function to the state after every step and the time.
     """
-    spacing = columns["spacing"]
-    mean = piece.before.origin + (columns["centre"] + spacing * columns["mean"])
+    origin, centre, spacing = place
+    mean = origin + (centre + spacing * columns["mean"])
     variance = spacing**2 * columns["variance"]
     health = {name: columns[source] for name, source in HEALTH.items()}
     health["tolerance_ratio"] = columns["made"] / prepared.promised

@@ -7,6 +7,7 @@ was gathered over more than the interval, belongs to the last part.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
@@ -333,9 +334,11 @@ FIELDS = (*(field.name for field in fields(Prepared)), *STEADY)
 def coefficients_of(prepared: Prepared, steady: CoefficientsInTime | None = None) -> CoefficientsInTime:
     """Return what the loop needs of the coefficients in time of all intervals; of one, `steady` has those that are constant."""
     schedule, system, theta = prepared.schedule, prepared.system, prepared.theta
+    resolved = system.resolved and not prepared.mixed
+    if steady is not None and resolved and system.steady_covariance and system.steady_noise and not system.samples:
+        return _factors_alone(prepared, steady)
     count, seen, m = len(schedule), schedule.seen, system.m
     starts, lengths, stops = schedule.starts[:, None], prepared.lengths[:, None], schedule.stops[:, None]
-    resolved = system.resolved and not prepared.mixed
     if prepared.timed:
         t = np.minimum(starts + lengths * GAUSS_NODES, np.nextafter(stops, starts))
         if system.samples or not resolved:
@@ -395,6 +398,20 @@ def coefficients_of(prepared: Prepared, steady: CoefficientsInTime | None = None
 
 
 _X = np.zeros(1)
+
+
+def _factors_alone(prepared: Prepared, steady: CoefficientsInTime) -> CoefficientsInTime:
+    """Return the coefficients of one interval in which only the factors of f and h, which the nodes resolve, vary in time."""
+    assert prepared.system.separated is not None
+    start, stop = float(prepared.schedule.starts[0]), float(prepared.schedule.stops[0])
+    t = np.minimum(start + prepared.lengths[0] * _NODES, math.nextafter(stop, start))
+    factors = prepared.system.separated[0](_X, t, prepared.theta)
+    _, outputs, covariances, precisions, constants, _ = steady
+    parts = _RESOLVED if np.isfinite(factors).all() else _UNRESOLVED
+    return CoefficientsInTime(factors, factors[:, : outputs.shape[1]], covariances, precisions, constants, parts)
+
+
+_NODES, _RESOLVED, _UNRESOLVED = GAUSS_NODES[None], np.ones(1, int), np.zeros(1, int)
 
 
 def _mixed_terms(prepared: Prepared, t: np.ndarray) -> np.ndarray:

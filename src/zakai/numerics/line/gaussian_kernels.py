@@ -116,7 +116,7 @@ def filtered(values: Array, taps: Array, after: Array, scale: Array, narrow: boo
     sum, and the largest value that may have become zero relative to the maximum, both of values times a scale.
     """
     size = values.size
-    count = 1 + min(size, taps.size) // 2 * 2
+    count = 1 + (min(size, taps.size) + 2) // 4 * 4
     padded, weights, moduli = np.zeros(size + 2 * count), np.zeros(count), np.empty(size)
     for n in range(min(count, taps.size)):
         weights[n] = taps[n]
@@ -124,18 +124,20 @@ def filtered(values: Array, taps: Array, after: Array, scale: Array, narrow: boo
         padded[count + j] = values[j]
         values[j] *= weights[0]
         moduli[j] = abs(values[j])
-    for n in range(1, count, 2):
-        below, above = padded[count - n : count - n + size], padded[count + n : count + n + size]
-        lower, higher = padded[count - n - 1 : count - n - 1 + size], padded[count + n + 1 : count + n + 1 + size]
-        near, far = weights[n], weights[n + 1]
+    for n in range(1, count, 4):  # four distances at once, as many as registers hold
+        a, b, c, d = padded[count - n :], padded[count - n - 1 :], padded[count - n - 2 :], padded[count - n - 3 :]
+        e, f, g, h = padded[count + n :], padded[count + n + 1 :], padded[count + n + 2 :], padded[count + n + 3 :]
+        one, two, three, four = weights[n], weights[n + 1], weights[n + 2], weights[n + 3]
         if narrow:
             for j in range(size):
-                inner, outer = below[j] + above[j], lower[j] + higher[j]
-                values[j] += near * inner + far * outer
-                moduli[j] += abs(near) * inner + abs(far) * outer
+                first, second, third, fourth = a[j] + e[j], b[j] + f[j], c[j] + g[j], d[j] + h[j]
+                values[j] = values[j] + (one * first + two * second) + (three * third + four * fourth)
+                near, far = abs(one) * first + abs(two) * second, abs(three) * third + abs(four) * fourth
+                moduli[j] = moduli[j] + near + far
         else:
             for j in range(size):
-                values[j] += near * (below[j] + above[j]) + far * (lower[j] + higher[j])
+                near, far = one * (a[j] + e[j]) + two * (b[j] + f[j]), three * (c[j] + g[j]) + four * (d[j] + h[j])
+                values[j] = values[j] + near + far
     total, top, noise, lost = 0.0, 0.0, 0.0, 0.0
     for j in range(size):
         weight = after[j] * scale[j]
