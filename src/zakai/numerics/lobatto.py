@@ -58,7 +58,9 @@ def interpolation(nodes: Array, weights: Array, points: Array) -> Array:
         points: (J,).
     """
     breaks, near = np.flatnonzero(np.diff(nodes) < _SAME * (nodes[-1] - nodes[0])) + 1, _NEAR * (nodes[-1] - nodes[0])
-    result, piece = np.zeros((len(points), len(nodes))), np.searchsorted(nodes[breaks], points, side="right")
+    # A density may jump at a common end: a point beside it belongs to its own side, however near it is.
+    ends = 0.5 * (nodes[breaks - 1] + nodes[breaks])
+    result, piece = np.zeros((len(points), len(nodes))), np.searchsorted(ends, points, side="right")
     for j, (first, last) in enumerate(zip([0, *breaks], [*breaks, len(nodes)], strict=True)):
         here = piece == j
         apart = points[here, None] - nodes[first:last]

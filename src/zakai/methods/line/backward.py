@@ -160,8 +160,8 @@ def density(prepared: Prepared, state: State, message: Message) -> Density:
 
 
 def accuracy(prepared: Prepared) -> float:
-    """Return the error of the evidence that a step of the filter may leave."""
-    return max(1e-6, prepared.promised)
+    """Return the error of the evidence above which a smoother warns: several intervals leave `smoothing_tolerance` each."""
+    return max(1e-5, prepared.promised)
 
 
 BACKWARD: Backward[Prepared, State, Message] = Backward(last_message, step, smoothed, density, segment, draw, accuracy)

@@ -190,20 +190,27 @@ def step(prepared: Prepared, k: int, message: Message, observed: np.ndarray, sta
     """Return the message at the start of interval k from that at its end; `state` is the filter's at the start."""
     inside = prepared.inside[k]
     message, before = message.on(_window(prepared, *(message.origin + end for end in message.ends))), message.variance
-    at_end = prepared.schedule.seen[k] & ~inside
-    if at_end.any():
-        likelihood = factor_at_end(prepared, k, at_end, observed, None)
+    at_end, later = prepared.schedule.seen[k] & ~inside, message
+    likelihood = factor_at_end(prepared, k, at_end, observed, None) if at_end.any() else None
+    if likelihood is not None:
         message = message._replace(logs=message.logs + likelihood.logs(message.window.points).real)
     if prepared.lengths[k] == 0:
         return message
+
+    def logs(x: Array) -> Array:
+        """Return the logarithm of the message with the likelihood, whose jumps no grid holds."""
+        return later.at(x - later.origin) + (0.0 if likelihood is None else likelihood.logs(x).real)
+
     interval = prepared.interval(k, inside, observed)
-    result = None if prepared.system.varying else _by_modes(prepared, message, interval, state)
-    result = _by_volumes(prepared, message, interval, state) if result is None else result
+    result = None if prepared.system.varying else _by_modes(prepared, message, logs, interval, state)
+    result = _by_volumes(prepared, message, logs, interval, state) if result is None else result
     retained = float(np.clip(message.variance / np.sqrt(max(before * result.variance, 1e-300)), 0.3, 1.0))
     return result._replace(error=result.error + retained * message.error)
 
 
-def _by_modes(prepared: Prepared, message: Message, interval: TimeInterval, state: State) -> Message | None:
+def _by_modes(
+    prepared: Prepared, message: Message, logs_at: Callable[[Array], Array], interval: TimeInterval, state: State
+) -> Message | None:
     """Return the message at the start of an interval by the modes of the operator, None where they do not serve.
 
         b(start) = U exp(-tau lambda) U' s b(stop) / s
@@ -219,9 +226,10 @@ def _by_modes(prepared: Prepared, message: Message, interval: TimeInterval, stat
     low, high = np.clip([message.origin + end for end in message.ends], domain.lower, domain.upper).tolist()
     lower, upper = apart(min(own.lower, low) - reach, max(own.upper, high) + reach, domain)
     after = element_of(prepared, low, high, QUADRATURE)
-    logs = message.at(after.points - message.origin)
+    logs = logs_at(after.points)
     top = float(np.max(logs))
     constant: Number = 0.0
+    bound = 1.0  # an expectation is at most the largest value; far out, where s is small, its rounding exceeds that
     weights = after.weights * np.exp(logs - top)
     for size in ELEMENT_SIZES[1:]:
         element = element_of(prepared, lower, upper, size)
@@ -230,7 +238,8 @@ def _by_modes(prepared: Prepared, message: Message, interval: TimeInterval, stat
             return None
         density, modes, root = own.at(values, element.points) * element.weights, known.modes, np.sqrt(element.weights)
         if inside.any():
-            modes, _, constant = weighted(prepared, known, element, interval, density)
+            modes, potential, constant = weighted(prepared, known, element, interval, density)
+            bound = float(np.exp(np.max((potential - constant).real)))
         between = element.interpolation(after.points)
         psi = (between.T @ (weights * np.exp(between @ known.logs - modes.top))) / root
         propagated = modes.decayed(psi, length)
@@ -246,12 +255,14 @@ def _by_modes(prepared: Prepared, message: Message, interval: TimeInterval, stat
 
     def expectation(x: Array) -> Array:
         at = element.interpolation(x)
-        return (at @ scaled) * np.exp(at @ log_s)
+        return np.asarray(np.minimum((at @ scaled) * np.exp(at @ log_s), bound))
 
     return _on(prepared, state, expectation, top + float(constant.real), error)
 
 
-def _by_volumes(prepared: Prepared, message: Message, interval: TimeInterval, state: State) -> Message:
+def _by_volumes(
+    prepared: Prepared, message: Message, logs_at: Callable[[Array], Array], interval: TimeInterval, state: State
+) -> Message:
     """Return the message at the start of an interval by finite volumes."""
     element, values = state.element, np.asarray(state.values).real
     ends, (mean, variance) = np.array([0.0, element.upper - element.lower]), message.moments
@@ -259,7 +270,7 @@ def _by_volumes(prepared: Prepared, message: Message, interval: TimeInterval, st
     aim = mean - shift, variance**0.5
     plan = cell_plan_of(prepared, values, element, ends, interval, aim)
     result = pulled_back(
-        prepared, lambda x: message.at(x + shift), lambda x: element.at(values, element.lower + x), plan, interval
+        prepared, lambda x: logs_at(x + element.lower), lambda x: element.at(values, element.lower + x), plan, interval
     )
     if result is None:
         return last_message(prepared, state)._replace(error=np.inf)
