@@ -9,6 +9,7 @@ from tests.references.graded import posterior
 
 import zakai
 
+HALF = lambda x: 1.0 * (x > 0.4)  # noqa: E731
 TIMES = np.cumsum([0.053, 0.11, 0.324, 0.241, 0.056, 0.185])
 
 
@@ -38,6 +39,10 @@ def exact(f, h, noise, values):
         ("-abs(x)*x", lambda x: -np.abs(x) * x, "x", lambda x: x, 0.2),
         ("-3*sign(x)", lambda x: -3.0 * np.sign(np.round(x, 9)), "x", lambda x: x, 0.2),
         ("1/2 - x - abs(x)", lambda x: 0.5 - x - np.abs(x), "abs(x)", np.abs, 0.1),
+        ("3/10 - x - max(x, 0)/2", lambda x: 0.3 - x - 0.5 * np.maximum(x, 0.0), "heaviside(x - 2/5)", HALF, 0.04),
+        ("-x", lambda x: -x, "heaviside(x - 2/5)", HALF, 0.04),
+        ("-x", lambda x: -x, "floor(2*x)", lambda x: np.floor(2.0 * x), 0.04),
+        ("-sign(x)", lambda x: -np.sign(np.round(x, 9)), "floor(2*x)", lambda x: np.floor(2.0 * x), 0.04),
     ],
 )
 def test_kinks_are_as_accurate_as_smooth_functions(drift, f, observation, h, noise):
@@ -49,8 +54,8 @@ def test_kinks_are_as_accurate_as_smooth_functions(drift, f, observation, h, noi
     assert np.max(errors) < 2e-5
     assert result.log_likelihood == pytest.approx(log_likelihood, abs=4e-5)
     assert np.max(errors) < 10.0 * np.nanmax(result.health["error_estimate"]) + 1e-5
-    if "sign" in drift:
-        assert np.nanmax(result.health["error_estimate"]) < 1e-6 and not result.warnings
+    if any(jump in drift + observation for jump in ("sign", "heaviside", "floor")):
+        assert np.nanmax(result.health["error_estimate"]) < 1e-5 and not result.warnings
         assert np.nanmax(zakai.smooth(model, record, "yau-yau").health["evidence_error"]) < 1e-6
 
 
@@ -203,3 +208,15 @@ def test_a_jump_of_the_drift_where_the_sensor_jumps_is_one():
 
     one, other = filtered(0), filtered(1e-5)
     assert np.isfinite(one.mean).all() and np.abs(one.mean - other.mean).max() < 1e-4
+
+
+@pytest.mark.parametrize("kind", ["samples", "increments"])
+def test_smoothing_leaves_the_evidence_of_the_filter_where_formulas_have_kinks(kind):
+    sensor = "abs(x)" if kind == "increments" else "heaviside(x - 2/5)"
+    model = zakai.Model(
+        state=["x"], drift=["-x*abs(x)"], observation=[sensor], observation_noise=[["1" if kind == "increments" else "0.04"]],
+        observation_kind=kind, prior={"kind": "gaussian", "mean": [0.0], "cov": [[1.0]]},
+    )  # fmt: skip
+    _, record = zakai.simulate(model, 0.5 * np.arange(1, 11), seed=3)
+    result = zakai.smooth(model, record)
+    assert not result.warnings and np.nanmax(result.health["evidence_error"]) < 1e-5

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from copy import copy
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import sympy as sp
@@ -16,6 +16,7 @@ from zakai.models.functions import Floor, Maximum, Minimum, TableFunction
 from zakai.models.kept import once_for_a_model
 from zakai.models.model import Model
 from zakai.models.numeric import numpy_function
+from zakai.models.prior import GaussianPrior, MixturePrior
 from zakai.numerics.arrays import Array
 from zakai.records.inputs import Inputs
 
@@ -75,19 +76,26 @@ def _formulas(model: Model) -> Formulas:
 def _roots(model: Model) -> list[sp.Expr]:
     """Return functions of x alone that are zero where f, G, or an h that acts within intervals, has a kink or a jump.
 
-    Where there are such, those of the h of samples follow.
+    The h of samples counts where it jumps. Where there are such functions, those of its kinks follow.
     """
-    dynamics = [model.drift[0], model.covariance[0]]
-    result = _zeros(model, [*dynamics, *([] if model.observation_kind == "samples" else model.observation)])
-    return sorted(result | _zeros(model, [*dynamics, *without_branch(model)]), key=str) if result else []
+    dynamics, h = [model.drift[0], model.covariance[0]], without_branch(model)
+    samples = model.observation_kind == "samples"
+    result = _zeros(model, dynamics if samples else [*dynamics, *model.observation])
+    if samples and not model.periodic and (not model.domain or _reflecting(model)):
+        result |= _zeros(model, h, _JUMPS)
+    return sorted(result | _zeros(model, [*dynamics, *h]), key=str) if result else []
 
 
-def _zeros(model: Model, formulas: list[sp.Expr]) -> set[sp.Expr]:
-    """Return functions of x alone that are zero where formulas have a kink or a jump."""
+def _reflecting(model: Model) -> bool:
+    return any(interval.reflecting for interval in model.domain.values())
+
+
+def _zeros(model: Model, formulas: list[sp.Expr], calls: tuple[Any, ...] = (*_JUMPS, *_KINKS, TableFunction)) -> set[sp.Expr]:
+    """Return functions of x alone that are zero where formulas have a kink or a jump, by some of the functions that have any."""
     x, given = model.x[0], {model.t, *model.u}
     result: set[sp.Expr] = set()
     for part in formulas:
-        for call in part.atoms(*_JUMPS, *_KINKS, TableFunction):
+        for call in part.atoms(*calls):
             first = call.args[0]
             if isinstance(call, (Minimum, Maximum)):
                 result.add(first - call.args[1])
@@ -165,16 +173,33 @@ def _rough(formula: sp.Expr, x: sp.Symbol) -> bool:
 def in_pieces(model: Model) -> bool:
     """Return whether densities of a state are polynomials between ends and kinks.
 
-    That is where ends reflect, and where f, G, or an h that acts within intervals, has kinks or jumps; but for a continuous f
-    without time between samples, for which a uniform grid is as accurate.
+    That is where ends reflect, and where f, G, an h that acts within intervals or the h of samples has jumps, or one of the first
+    three kinks; but for a continuous f without time between samples of a continuous h, for which a uniform grid is as accurate.
     """
-    if any(interval.reflecting for interval in model.domain.values()):
+    if _reflecting(model):
         return True
-    if model.n > 1 or model.domain or model.periodic or not 0 < len(_roots(model)) <= MOST_PIECES:
+    roots = _roots(model)
+    if model.n > 1 or model.domain or model.periodic or not 0 < len(roots) <= MOST_PIECES or not _few(model, roots):
         return False
     f, G, x = model.drift[0], model.covariance[0], model.x[0]
     steady = model.observation_kind == "samples" and not (f.free_symbols | G.free_symbols) & {model.t, *model.u}
-    return not (steady and _continuous(f, x) and _continuous(G, x) and not _rough(G, x))
+    return not (steady and all(_continuous(part, x) for part in (f, G, *without_branch(model))) and not _rough(G, x))
+
+
+MOST_KINKS = 128  # in an interval between which a density is a polynomial
+_PLACES = 4099  # where roots are sought: distances that differ show those of a period as well
+
+
+def _few(model: Model, roots: list[sp.Expr]) -> bool:
+    """Return whether roots are few where the prior is: those of fine quantisation are not."""
+    if not isinstance(model.prior, GaussianPrior | MixturePrior):
+        return True
+    _, means, covs = model.prior.components
+    reach = 6.0 * np.sqrt(covs[:, 0, 0])
+    low, high = float(np.min(means[:, 0] - reach)), float(np.max(means[:, 0] + reach))
+    x = low + (high - low) * np.sort(np.arange(1, _PLACES) * 0.6180339887498949 % 1.0)
+    negative = numpy_function(roots, model, (len(roots),))(x[:, None], model.start, model.theta()) < 0
+    return int(np.sum(negative[1:] != negative[:-1])) <= MOST_KINKS
 
 
 class System:
@@ -187,7 +212,7 @@ class System:
         self._bind(None)
         # Whether G depends on the state, and whether samples have a law that is not N(h, S(t)).
         self.state_dependent = STATE_DEPENDENT_DIFFUSION in model.features
-        self.reflecting = any(interval.reflecting for interval in model.domain.values())
+        self.reflecting = _reflecting(model)
         self.general = bool(OF_OBSERVATION & model.features.keys())
         # Whether h, or the law of what is observed, has no jump and no kink.
         law = [*without_branch(model), *([] if model.log_density is None else [model.log_density])]

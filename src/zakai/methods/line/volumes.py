@@ -14,7 +14,7 @@ import numpy as np
 
 from zakai.methods.line.coefficients import coefficients, covariance_at, resolved_parts
 from zakai.methods.line.domain import ends_of_leak
-from zakai.methods.line.model import finite, within
+from zakai.methods.line.model import MOST_KINKS, finite, within
 from zakai.methods.line.prepared import Prepared, TimeInterval
 from zakai.methods.line.report import Report
 from zakai.methods.line.transition import Prediction
@@ -30,7 +30,7 @@ LEVELS = ((256, 24), (512, 34), (1024, 48), (2048, 68), (4096, 96), (8192, 136),
 FIRST = 0.1  # of the time in which the drift would cross the range of the density: the first step
 FASTEST = 100.0  # ranges of the density in the interval, divided by the tolerance: a faster drift counts as this
 KINK_PROBES = 1025  # points between which kinks are sought
-MOST_KINKS = 16
+MOST_CUTS = 16  # kinks that are faces
 ONE_KINK = 1e-10  # distance, of the interval, of the kinks of two coefficients that are one
 PROBES = 65  # points between which a formula ceases to have values
 DIFFUSED = 0.5  # of the time in which noise would double the variance: the first step
@@ -146,8 +146,10 @@ def drift_along(prepared: Prepared, window: lw.Points, offsets: Array, t: float)
 def _cuts(prepared: Prepared, cells: Volumes, start: float) -> tuple[float, ...]:
     """Return where in the range of cells coefficients have kinks or jumps, in s; nothing where these are many."""
     lower, upper = cells.origin + cells.centre + cells.scale * np.sinh([cells.first, cells.last])
-    result, apart = [cells.first], 1e-6 * (cells.last - cells.first)
-    for s in np.arcsinh((kinks_between(prepared, lower, upper, start) - cells.origin - cells.centre) / cells.scale):
+    result, apart, kinks = [cells.first], 1e-6 * (cells.last - cells.first), kinks_between(prepared, lower, upper, start)
+    if len(kinks) > MOST_CUTS:
+        return ()
+    for s in np.arcsinh((kinks - cells.origin - cells.centre) / cells.scale):
         if s - result[-1] > apart and cells.last - s > apart:
             result.append(float(s))
     return tuple(result[1:])

@@ -32,8 +32,9 @@ from zakai.numerics.lobatto import Element
 ELEMENT_SIZES = (24, 32, 48, 64, 96, 128, 192, 256)
 SIZES_OF_PRIORS = (*ELEMENT_SIZES, 512, 1024)  # of which no operator is decomposed
 SAMPLES = 1001  # points at which the place of a density is sought
-MARGIN_OF_KINK = 0.02  # of the length of an element, within which of its end a kink does not count
-BESIDE = 1e-6  # the same for an end of the domain
+FEW_KINKS = 2, 5  # from which half and a third of the points serve
+MOST_OF_PART = 64  # points on one part of an interval: the rounding of longer ones exceeds the tolerance
+BESIDE = 1e-6  # of the length of an element, within which of its end a kink does not count
 
 
 def domain_of(prepared: Prepared) -> Interval:
@@ -41,15 +42,25 @@ def domain_of(prepared: Prepared) -> Interval:
 
 
 def element_of(prepared: Prepared, lower: float, upper: float, size: int) -> Element:
-    """Return an element with cuts where coefficients have kinks or jumps, except near ends where the density is negligible."""
+    """Return an element with cuts where coefficients have kinks or jumps, except near ends where the density is negligible.
+
+    Between two of these are `size` points, fewer where kinks are many, and on equal parts where points are many.
+    """
     if prepared.system.kinks is None:
-        return Element(lower, upper, size)
-    unit, width, domain = 2.0 ** np.ceil(np.log2(upper - lower)), upper - lower, domain_of(prepared)
+        return _divided([lower, upper], size)
+    unit, beside = 2.0 ** np.ceil(np.log2(upper - lower)), BESIDE * (upper - lower)
     low, high = float(unit * np.floor(lower / unit)), float(unit * np.ceil(upper / unit))
     known = prepared.once(Derived.KINKS, (low, high), lambda: kinks_between(prepared, low, high, prepared.model.start).tolist())
-    first = lower + width * (BESIDE if lower <= domain.lower else MARGIN_OF_KINK)
-    last = upper - width * (BESIDE if upper >= domain.upper else MARGIN_OF_KINK)
-    return Element(lower, upper, size, tuple(kink for kink in known if first < kink < last))
+    kinks = [kink for kink in known if lower + beside < kink < upper - beside]
+    return _divided([lower, *kinks, upper], size // (1 + (len(kinks) >= FEW_KINKS[0]) + (len(kinks) >= FEW_KINKS[1])))
+
+
+def _divided(bounds: list[float], size: int) -> Element:
+    """Return an element with `size` points in each interval, on equal parts of it where they are many."""
+    parts = 2 ** max(int(np.ceil(np.log2(size / MOST_OF_PART))), 0)
+    low, high = np.array(bounds[:-1]), np.array(bounds[1:])
+    ends = low[:, None] + (high - low)[:, None] * np.arange(parts) / parts
+    return Element(bounds[0], bounds[-1], size // parts, tuple(ends.reshape(-1)[1:].tolist()))
 
 
 def negligible_of(prepared: Prepared, error: float = 0.0) -> float:
@@ -194,6 +205,7 @@ def moments(values: Array, element: Element) -> tuple[Number, Number]:
 
 COUNTS = 1e-14  # density relative to the maximum beyond which it is rounding
 EDGE_OF_ELEMENT = 1e-12  # density at an end that is not one of the domain, relative to the maximum
+LARGEST = 1000  # points of an element, above which no finer one is tried: its decomposition takes longer than volumes
 TRIALS = 24  # elements that are tried
 MOST_PARTS = 64  # of an interval that the volumes do not take as a whole
 PEAK = 1.5  # points in a standard deviation of the noise with which the first element begins
@@ -249,9 +261,9 @@ def _by_modes(
         coarse = unresolved > negligible
         # Oscillations of what is not resolved reach the ends as well.
         left, right = (float(end) > (unresolved if coarse else EDGE_OF_ELEMENT) for end in reached(result, new, domain))
-        if coarse and size < ELEMENT_SIZES[-1]:
+        if coarse and size < ELEMENT_SIZES[-1] and len(result) <= LARGEST:
             size = ELEMENT_SIZES[ELEMENT_SIZES.index(size) + 1]
-        elif coarse:
+        elif coarse:  # even more points take longer than volumes
             return None
         elif left or right:
             width = upper - lower
