@@ -28,6 +28,7 @@ from zakai.numerics.line.product import (
     Product,
     at_nodes,
     finer,
+    middles,
     nodes,
     normalized,
     weak,
@@ -45,7 +46,7 @@ def resampled(prepared: Prepared, values: Array, window: lw.Window, new: lw.Wind
     """Return probabilities on another grid, in the weak sense on a coarser one where densities have kinks."""
     if not prepared.weak or new.spacing <= window.spacing:
         return lw.resampled(values, window, new)
-    density = at_nodes(lw.density_at(values, window, nodes(new.offsets, new.spacing)))
+    density = lw.density_at(values, window, middles(new.offsets, new.spacing))
     result = weak(density, new.spacing)[0] * (new.spacing / window.spacing)
     return np.where(result > 0, result, 0.0)
 

@@ -292,6 +292,12 @@ def nodes(points: Array, spacing: float) -> Array:
     return np.asarray(first + spacing / (NODES_OF_SPACING * _WITHIN) * (np.arange(count * _WITHIN) + 0.5))
 
 
+def middles(points: Array, spacing: float) -> Array:
+    """Return the nodes of a grid (N,), where the values of a function that is smooth within each are those of `at_nodes`."""
+    count = (len(points) + 2 * SPLINE_REACH - 1) * NODES_OF_SPACING
+    return np.asarray(points[0] - spacing * SPLINE_REACH + spacing / NODES_OF_SPACING * (np.arange(count) + 0.5))
+
+
 def at_nodes(values: Array) -> Array:
     """Return a function at the nodes (..., (N + 2 REACH - 1) PARTS): means, less what the curvature of a smooth one adds."""
     means = values.reshape(*values.shape[:-1], -1, _WITHIN).mean(axis=-1)
