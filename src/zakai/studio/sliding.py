@@ -50,8 +50,8 @@ def coarse(result: Any, method: str, options: dict[str, Any]) -> tuple[str, dict
     if method == "auto" and result.method in _registry.METHODS:
         method = result.method
     names = [method] if method in _registry.METHODS else [block.method for block in result.blocks]
-    usual = [of["tolerance"] for name in names if name in _registry.METHODS and "tolerance" in (of := _registry.load(name).options)]
-    if usual:
+    every = [_registry.load(name).options for name in names if name in _registry.METHODS]
+    if usual := [of["tolerance"] for of in every if "tolerance" in of]:
         own = [COARSER * tolerance for tolerance in usual if tolerance is not None]
         given = options.get("tolerance")
         options = {**options, "tolerance": max(COARSE, *own, given if isinstance(given, float) else 0.0)}
