@@ -29,22 +29,29 @@ _IMAGES = 4  # of Student's law on each side; the rest is their integral, by the
 def observed_angles(model: Model) -> tuple[bool, ...]:
     """Return for every observation (m) whether it is an angle whose differences z - h are taken modulo 2 pi.
 
-    That is a sample with a Gaussian or Student's law whose observation is an `atan2(...)`, or whose name stands in the model key
-    `observed_angles`.
+    That is a sample with a Gaussian or Student's law whose observation is an `atan2(...)`, or a sum with one, such as a bearing
+    from a heading, or whose name stands in the model key `observed_angles`.
     """
     if model.observation_kind != "samples" or model.log_density is not None:
         return (False,) * model.m
     return tuple(
-        family in LINEAR and (isinstance(formula, sympy.atan2) or name in model.observed_angles)
+        family in LINEAR and (bool(_directions(formula)) or name in model.observed_angles)
         for family, formula, name in zip(model.observation_family, model.observation, model.observation_names, strict=True)
     )
+
+
+def _directions(formula: sympy.Expr) -> list[sympy.Expr]:
+    """Return the terms of a sum that are an atan2, with either sign."""
+    return [term for term in sympy.Add.make_args(formula) if isinstance(term, sympy.atan2) or isinstance(-term, sympy.atan2)]
 
 
 def without_branch(model: Model) -> list[sympy.Expr]:
     """Return formulas that are as smooth as the law of the observations: of an angle the arguments of atan2, without its jump."""
     found: list[sympy.Expr] = []
     for formula, angle in zip(model.observation, observed_angles(model), strict=True):
-        found.extend(formula.args if angle and isinstance(formula, sympy.atan2) else [formula])
+        directions = _directions(formula) if angle else []
+        found.extend(part for term in directions for part in (term if isinstance(term, sympy.atan2) else -term).args)
+        found.extend([] if formula in directions else [formula - sum(directions)])
     return found
 
 
