@@ -23,7 +23,7 @@ from zakai.models.model import Model
 from zakai.records import Inputs, Record
 
 USUAL = 5, 10  # evaluations for each parameter, and as many more, that a search with gradients usually takes
-SMALL = 0.1  # of a standard error, by which the jumps of a log-likelihood may move its maximum without a warning
+SMALL = 0.1  # of a standard error, by which random errors or jumps of a log-likelihood may move its maximum without a warning
 COARSER = 4.0  # times the tolerance for the search, where the log-likelihood has small jumps; not for the maximum at its end
 
 
@@ -275,8 +275,8 @@ def _fit_by_values(
         found = random_maximum(value, values, box, first is not None)
         result = result_at(found.values, 0)
     errors = np.sqrt(np.diag(found.covariance))
-    # Jumps of a log-likelihood matter where they move the maximum by a part of a standard error.
-    matters = first is not None or not (found.errors <= SMALL * errors).all()
+    # Random errors and jumps of a log-likelihood matter where they move the maximum by a part of a standard error.
+    matters = not (found.errors <= SMALL * errors).all()
     warnings = [*([sentence(names, found, first is not None)] if matters else []), *result.warnings]
     if not found.converged:
         warnings.insert(0, "the fit did not converge; these are the best values that were found")
@@ -288,7 +288,8 @@ def _fit_by_values(
         model=model.with_parameters(**estimates),
         converged=found.converged,
         message=f"{'converged' if found.converged else 'not converged'}: quadratics through values"
-        + (" with common random numbers" if first is not None else "" if matters else f"; {sentence(names, found, False)}"),
+        + (" with common random numbers" if first is not None else "")
+        + ("" if matters else f"; {sentence(names, found, first is not None)}"),
         iterations=found.iterations,
         covariance=found.covariance,
         method=result.method,
