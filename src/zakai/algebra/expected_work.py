@@ -6,6 +6,7 @@ tolerance, never from a clock, so that a model is filtered by the same method on
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -23,15 +24,18 @@ POINT, PARTICLE = 9e-6, 1e-5
 AXIS = 32  # points along an axis of a grid for a density near a Gaussian
 MOST_OF_AXIS = {2: 512, 3: 128, 4: 40}  # points along an axis that a grid has at most
 MOST_POINTS = 2**18
+# Seconds of one computation of a density at a point of a grid, of which a substep makes three or more; and how many times the
+# work of particles a grid may take for the first interval, which begins with the prior: "auto" never takes what needs ten times.
+GRID_POINT, MOST_TIMES = 5e-7, 10.0
 WIDE = 4.0  # curvature of a level of h, in deviations of its noise, that adds the points of one more grid
 PARTICLES = 5.0  # particles, times the square of the tolerance
 TOLERANCE = 0.03  # of particles, where none is asked for
 DRAWS = 64  # points of the prior at which the sensors and the drift are differentiated
 STEP = 1e-3  # of these differences, in deviations of the prior
-# Seconds of one product of an evaluation of a train, and of all else in an observation; builds of an observation, points along an
-# axis, and builds for one column of a noise that depends on the state.  The product is three times as long as is measured, as a
-# rank that is 1.4 times the expected one makes it.
-PRODUCT, AROUND = 3.6e-8, 0.01
+# Seconds of one product of an evaluation of a train, and of all else in an observation; builds of a substep, points of an axis,
+# and builds for one column of a noise that depends on the state.  The expected work is `MARGIN` times what the expected rank
+# gives, as a rank that is 1.4 times the expected one makes it.
+PRODUCT, AROUND, MARGIN = 1.2e-8, 0.01, 3.0
 BUILDS, TRAIN_AXIS, KICK = 2.5, 30, 20
 MOST_STATES, MOST_RANK = 6, 24
 # Rank of a train: of a system near a linear one, per relative variation of the drift's derivatives over the prior, per square of
@@ -66,6 +70,25 @@ def expected_work(name: str, model: Model, tolerance: float | None) -> Work | No
     return None
 
 
+def most_seconds(model: Model, tolerance: float | None) -> float:
+    """Return the work that a method may need for the first interval."""
+    particles = expected_work("guided-particles", model, tolerance)
+    return np.inf if particles is None else MOST_TIMES * particles.seconds
+
+
+def most_points(model: Model, tolerance: float | None) -> float:
+    """Return at how many points a grid may compute a density in the first interval."""
+    return most_seconds(model, tolerance) / GRID_POINT
+
+
+def work_of_step(name: str, model: Model, health: Mapping[str, float]) -> Work | None:
+    """Return the work of a step from its health figures; None for a method that does not report it."""
+    if name != "tensor-train":
+        return None
+    rank, substeps = health["rank"], health["substeps"]
+    return _of_builds(model, rank, substeps * BUILDS)
+
+
 def _of_grid(model: Model) -> Work:
     """Return the work of a density on a grid.
 
@@ -79,10 +102,7 @@ def _of_grid(model: Model) -> Work:
 
 
 def _of_train(model: Model, tolerance: float | None) -> Work | None:
-    """Return the work of a tensor train; None where the model and the prior do not give its rank.
-
-    A build takes about n - 2 cores of r^2 N fibres and two of r N, each an evaluation of n r products.
-    """
+    """Return the work of a tensor train; None where the model and the prior do not give its rank."""
     n = model.n
     laws = (features.OF_OBSERVATION - {features.OBSERVED_ANGLES}) & model.features.keys()
     prior = model.prior
@@ -94,8 +114,16 @@ def _of_train(model: Model, tolerance: float | None) -> Work | None:
         return None
     rank = RANK + OF_DRIFT * variation(model) + OF_SENSORS * curvature(model) ** 2
     rank *= (usual / tolerance) ** OF_TOLERANCE
-    used = min(rank, MOST_RANK)
-    builds = BUILDS * (KICK * model.diffusion.shape[1] if model.diffusion.free_symbols & set(model.x) else 1)
+    return _of_builds(model, rank, MARGIN * BUILDS)
+
+
+def _of_builds(model: Model, rank: float, builds: float) -> Work:
+    """Return the work of so many builds of a train; one of a rank beyond the largest is expected to fail.
+
+    A build takes about n - 2 cores of r^2 N fibres and two of r N, each an evaluation of n r products.
+    """
+    n, used = model.n, min(rank, MOST_RANK)
+    builds *= KICK * model.diffusion.shape[1] if model.diffusion.free_symbols & set(model.x) else 1
     evaluations = TRAIN_AXIS * ((n - 2) * used**2 + 2 * used)
     words = f"a tensor train of rank {_display.rough(rank)}"
     return Work(AROUND + PRODUCT * builds * evaluations * n * used, words, not rank <= MOST_RANK)

@@ -47,6 +47,7 @@ FINER = 2.0  # ratio of the spacings of a grid to those of its splines, where th
 SHARE = 0.2  # of the tolerance, for the error in time of one interval
 LOST = 0.5  # error of a density relative to itself
 KEPT = 0.98  # largest share of an error that an interval is taken to leave
+OF_FIELDS = 10.0  # work of a point where the noise depends on the state, in that of others (measured: 8 to 20)
 WIDER = 1.1  # growth of the deviations after which the error of a substep is measured again
 
 
@@ -61,7 +62,8 @@ class Increments(NamedTuple):
 class Prepared:
     """A model, a schedule and parameters, with the bounds that follow from the tolerance.
 
-    `lie` tells whether the filter splits an interval at its end only, which has no backward pass.
+    `lie` tells whether the filter splits an interval at its end only, which has no backward pass.  An interval in which a density
+    would be computed at more than `most_work` grid points loses it.
     """
 
     model: Model
@@ -74,6 +76,7 @@ class Prepared:
     notes: tuple[str, ...] = ()
     motions: dict[Any, Any] = field(default_factory=dict)
     lie: bool = False
+    most_work: float = math.inf
 
     def init(self, prior: Any) -> State:
         """Return the prior on a grid."""
@@ -88,6 +91,10 @@ class Prepared:
         """Return the state of a prior."""
         mass, control = field.values.sum() * field.grid.cell, Control(np.inf, 0.0, 0)
         return self._state(field, mass, control, np.zeros(self.model.n), error, 0.9)
+
+    def bounded(self, points: float) -> Prepared:
+        """Return the same with a bound on the work in an interval."""
+        return replace(self, most_work=points)
 
     @property
     def correlated(self) -> bool:
@@ -209,7 +216,8 @@ class Prepared:
                 mean, cov = moments_of(result.values.real, result.grid, bounds.periodic)
                 points = mean + np.concatenate([np.zeros((1, len(mean))), np.diag(np.sqrt(np.diagonal(cov)))])
                 least = max(fewest, observations.least(points, start, length, inside))
-            stepper = Stepper(observations.dynamics, bounds, self.tolerance)
+            most_work = self.most_work / (OF_FIELDS if observations.system.state_dependent else 1.0)
+            stepper = Stepper(observations.dynamics, bounds, self.tolerance, most_work)
             if steppers is not None:
                 steppers.append(stepper)
             result, more, control = advance(stepper, result, start, length, potential, control, allowed / len(parts), least)

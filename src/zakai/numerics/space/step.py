@@ -56,12 +56,20 @@ class Substep(NamedTuple):
 
 
 class Stepper:
-    """Substeps of one interval."""
+    """Substeps of one interval.
 
-    def __init__(self, dynamics: Dynamics, bounds: Bounds, tolerance: float):
-        self.dynamics, self.bounds, self.tolerance = dynamics, bounds, tolerance
+    `work` are the grid points at which a density was computed; with more than `most_work` the stepper is `exhausted`.
+    """
+
+    def __init__(self, dynamics: Dynamics, bounds: Bounds, tolerance: float, most_work: float = math.inf):
+        self.dynamics, self.bounds, self.tolerance, self.most_work, self.work = dynamics, bounds, tolerance, most_work, 0
         self.taken: list[tuple[Substep, ...]] = []  # single substeps, and the two halves of extrapolated ones
         self._linearised: tuple[Array, tuple[float, ...], list[Linearisation]] | None = None
+
+    @property
+    def exhausted(self) -> bool:
+        """Whether more work was done than is allowed."""
+        return self.work > self.most_work
 
     def _linear(self, field: Field, times: tuple[float, ...]) -> list[Linearisation]:
         """Return the system over intervals that follow each other, linearised in the middle of the path of the mean."""
@@ -164,6 +172,7 @@ class Stepper:
 
         `begun` is their displacement from the end to a time in between.
         """
+        self.work += math.prod(move.target.sizes)
         return after_motion(source, move, self.dynamics, (t0, t1), potential, self.bounds, begun)
 
     def limit(self, field: Field, t0: float, t1: float) -> float:
@@ -194,7 +203,7 @@ class Stepper:
                 break
             best, smallest = (result, moved, report), report.of_grid(reach)
             coarse = refinable(found.tails, before, ratio, tails, self.bounds)
-            if attempt == TRIES - 1 or not (wide.any() or coarse.any()) or found.tails.max() >= 1.0:
+            if attempt == TRIES - 1 or not (wide.any() or coarse.any()) or found.tails.max() >= 1.0 or self.exhausted:
                 break
             ends = 0.2 * np.where(wide, 1.0, 0.0)
             finer = np.where(coarse, np.clip(self.bounds.spacings / deviations_in_spacings(found.tails), 1.1, 2.0), 1.0)
@@ -258,6 +267,8 @@ class Stepper:
         tails = field.survey(self.bounds).tails
         half, _, first = self._moved(field, t0, middle, one, potential, tails)
         half = positive(half, self.bounds)
+        if self.exhausted:
+            return half, first, np.inf
         fine, moved, second = self._moved(half, middle, t1, two, potential, tails)
         self._take(
             Substep(field, (t0, middle), one.linear, one.steps, potential, half.grid),
