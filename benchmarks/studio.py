@@ -73,8 +73,10 @@ def studio() -> Iterator[tuple[str, subprocess.Popen[str]]]:
     command = [sys.executable, "-m", "zakai", "studio", "--no-browser"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
-        yield process.stdout.readline().split()[-1], process
-        process.terminate()
+        try:
+            yield process.stdout.readline().split()[-1], process
+        finally:
+            process.terminate()
 
 
 @contextmanager

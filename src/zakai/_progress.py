@@ -7,6 +7,7 @@ import sys
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, nullcontext
+from contextvars import ContextVar
 from importlib.util import find_spec
 from threading import Lock, Timer
 from typing import Any, TypeVar
@@ -19,6 +20,7 @@ FIRST = 5.0  # seconds after which long work is announced
 Advance = Callable[[int, int | None], None]
 Progress = Callable[[int, int], None]
 _LOG = logging.getLogger("zakai")
+_WITHIN: ContextVar[bool] = ContextVar("within", default=False)
 _LOCK = Lock()  # one bar at a time: work inside of other work has none of its own
 
 
@@ -36,11 +38,17 @@ def announced(what: str) -> Iterator[Callable[[float, float, float], None]]:
     Yields a function of the parts of the work that are done, and of the fewest and the most that there usually are in all; the
     rest is estimated from the time between its calls.
     """
-    work = _Announced(what)
+    work, before = _Announced(what), _WITHIN.set(True)
     try:
         yield work.advance
     finally:
+        _WITHIN.reset(before)
         work.timer.cancel()
+
+
+def within_announced() -> bool:
+    """Return whether this work is a part of other work that is announced as a whole."""
+    return _WITHIN.get()
 
 
 class _Announced:

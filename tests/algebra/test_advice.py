@@ -70,6 +70,7 @@ def test_a_method_without_angles_says_to_leave_periodic_out():
             {"observation": ["a"], "observation_kind": "samples"},
             'list the observation in observed_angles, or set observation_family = "von-mises"',
         ),
+        ({"observation": ["1 - a"], "observation_kind": "samples"}, "list the observation in observed_angles"),
         ({"observation": ["a"]}, "write it in cos(a) and sin(a), or leave a out of periodic"),
         ({"drift": ["-a"], "observation": ["sin(a)"]}, "write it in cos(a) and sin(a), or leave a out of periodic"),
     ],

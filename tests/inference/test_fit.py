@@ -377,3 +377,20 @@ def test_a_fit_that_takes_long_is_announced(monkeypatch, caplog):
     )  # fmt: skip
     zakai.fit(model, zakai.Record([0.5, 1.0, 1.5], [0.4, 0.3, 0.1], "samples"))
     assert re.search(r"fit: the search for the largest log-likelihood by a takes (at most )?about \d+ to \d+ s more", caplog.text)
+
+
+def test_filters_of_a_fit_are_not_announced_one_by_one(monkeypatch, caplog):
+    from zakai.engine import batch
+
+    for name in ("FIRST", "EARLY", "SURE", "LONG"):
+        monkeypatch.setattr(batch, name, 0.0)
+    model = zakai.Model(
+        state=["x"], drift=["-a*x"], observation=["x"], observation_kind="samples", parameters={"a": 1.0},
+        prior={"kind": "gaussian", "mean": [0], "cov": [[1]]},
+    )  # fmt: skip
+    record = zakai.Record(np.arange(1, 200) * 0.05, np.sin(np.arange(1, 200)), "samples")
+    zakai.filter(model, record, "guided-particles", particles=500)
+    assert "more observations take" in caplog.text
+    caplog.clear()
+    zakai.fit(model, record, method="guided-particles", particles=500)
+    assert "more observations take" not in caplog.text

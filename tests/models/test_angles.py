@@ -18,6 +18,8 @@ def test_a_sample_of_atan2_is_an_angle_and_others_are_named():
     assert observed_angles(model(observed_angles=["x"])) == (True, True)
     named = model(observation_names=["bearing", "position"], observed_angles=["position"])
     assert observed_angles(named) == (True, True)
+    assert observed_angles(model(observation=["atan2(y, x) - x/2", "1 - atan2(y, x)"])) == (True, True)
+    assert observed_angles(model(observation=["atan2(y, x)/2", "sin(atan2(y, x))"])) == (False, False)
     assert observed_angles(model(observation_kind="increments")) == (False, False)
     assert observed_angles(model(observation_family=["von-mises", "gaussian"], concentration="4")) == (False, False)
 

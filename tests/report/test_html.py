@@ -174,6 +174,7 @@ LAWS = {
     },
     "z(tk)=max(x,0)+atan2(x,t)+r": {"observation": ["max(x, 0) + atan2(x, t)"]},
     "z(tk)=r+ε": {"state": ["r"], "drift": ["-r"], "observation": ["r"]},
+    "dv1=−0.4v1dt+0.3dβ": {"state": ["v1"], "drift": ["-0.4*v1"], "diffusion": [["0.3"]], "observation": ["v1/2"]},
 }  # fmt: skip
 
 

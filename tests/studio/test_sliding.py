@@ -77,6 +77,15 @@ def test_a_dragged_value_gives_what_the_filter_gives(ask, text: str):
         assert np.allclose(drawn["mean"], expected.mean[:, 0], rtol=0, atol=1e-9)
 
 
+def test_dragging_takes_fewer_particles_than_the_result_has(ask):
+    circling = BLOCKS.replace("a*(x - x**3)", "a*y").replace("b*(y - y**3)", "-b*sin(x)")
+    ask("run", text=circling, method="guided-particles")
+    header, _ = ask("slide", text=circling, method="guided-particles", values={"a": 1.1})
+    _, record = zakai.simulate(model_of(circling), np.arange(1, 21) * 0.1, seed=3)
+    expected = zakai.filter(model_of(circling).with_parameters(a=1.1), record, "guided-particles", tolerance=0.09)
+    assert header["log_likelihood"] == pytest.approx(expected.log_likelihood, abs=1e-9)
+
+
 @pytest.mark.parametrize(("text", "value"), [(WELLS, 0.0), (MOVING, 0.3)])
 def test_a_value_at_which_a_noise_is_none_is_refused(ask, text: str, value: float):
     ask("run", text=text)

@@ -10,7 +10,7 @@ from contextlib import nullcontext
 from threading import Event, Lock, Thread
 from typing import Any
 
-from zakai._progress import FIRST, Progress, bar
+from zakai._progress import FIRST, Progress, bar, within_announced
 from zakai.algebra.choice import faster
 from zakai.engine.loop import Run
 from zakai.numerics.compiled import working_time
@@ -49,7 +49,10 @@ def _watched(
     threads = min(most_threads, len(runs))
     watch = _Watch(sum(len(run.schedule) for run in runs), threads, progress, blocks)
     finished = Event()
-    Thread(target=watch.report_early, args=(runs[:1], finished), daemon=True).start()
+    if within_announced():
+        watch.slow = 2
+    else:
+        Thread(target=watch.report_early, args=(runs[:1], finished), daemon=True).start()
     try:
         if threads == 1:
             for run in runs:

@@ -23,7 +23,8 @@ from zakai.models.model import Model
 from zakai.records import Inputs, Record
 
 USUAL = 5, 10  # evaluations for each parameter, and as many more, that a search with gradients usually takes
-SMALL = 0.1  # of a standard error, by which the jumps of a log-likelihood may move its maximum without a warning
+SMALL = 0.1  # of a standard error, by which random errors or jumps of a log-likelihood may move its maximum without a warning
+COARSER = 4.0  # times the tolerance for the search, where the log-likelihood has small jumps; not for the maximum at its end
 
 
 @dataclass(frozen=True, eq=False)
@@ -229,7 +230,7 @@ def _fit_by_values(
     where: tuple[tuple[str, ...], np.ndarray, np.ndarray],
     method: str,
     options: dict[str, Any],
-    maker: Callable[[], Any] | None,
+    maker: Callable[[float], Any] | None,
 ) -> Fit:
     """Return the fit by values of a log-likelihood, with common random numbers or choices.
 
@@ -245,6 +246,7 @@ def _fit_by_values(
     known: dict[tuple[bytes, int], float] = {}
     options, choices = dict(options), dict[int, Any]()
     first = options.pop("seed", 0)
+    final = 1.0 if maker is None else COARSER  # how much longer a value at the end takes, as the tolerance is smaller
 
     def result_at(theta: np.ndarray, seed: int, common: Any = None) -> Any:
         at = model.with_parameters(**dict(zip(names, theta.tolist(), strict=True)))
@@ -261,19 +263,20 @@ def _fit_by_values(
                 if advance is not None:
                     advance(len(known) + 1, None)
                 if maker is not None and seed not in choices:
-                    choices[seed] = maker()
+                    choices[seed] = maker(COARSER if seed < 0 else 1.0)
                 try:
                     known[key] = result_at(theta, seed, choices.get(seed)).log_likelihood
                 except InputError:
                     known[key] = -np.inf
-                announce(len(known), *usual_values(len(names), first is not None))
+                done = len(known) + (final - 1.0) * sum(of >= 0 for _, of in known)
+                announce(done, *usual_values(len(names), first is not None, final))
             return known[key]
 
         found = random_maximum(value, values, box, first is not None)
-    result = result_at(found.values, 0)
+        result = result_at(found.values, 0)
     errors = np.sqrt(np.diag(found.covariance))
-    # Jumps of a log-likelihood matter where they move the maximum by a part of a standard error.
-    matters = first is not None or not (found.errors <= SMALL * errors).all()
+    # Random errors and jumps of a log-likelihood matter where they move the maximum by a part of a standard error.
+    matters = not (found.errors <= SMALL * errors).all()
     warnings = [*([sentence(names, found, first is not None)] if matters else []), *result.warnings]
     if not found.converged:
         warnings.insert(0, "the fit did not converge; these are the best values that were found")
@@ -285,7 +288,8 @@ def _fit_by_values(
         model=model.with_parameters(**estimates),
         converged=found.converged,
         message=f"{'converged' if found.converged else 'not converged'}: quadratics through values"
-        + (" with common random numbers" if first is not None else "" if matters else f"; {sentence(names, found, False)}"),
+        + (" with common random numbers" if first is not None else "")
+        + ("" if matters else f"; {sentence(names, found, first is not None)}"),
         iterations=found.iterations,
         covariance=found.covariance,
         method=result.method,

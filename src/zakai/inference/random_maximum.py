@@ -18,8 +18,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 Array = Any
-ROUNDS, SEEDS = 12, 4
+ROUNDS, SEEDS, FEWEST = 12, 4, 2  # rounds of a search; sets of values at its end, and without seeds at least
 USUAL = 2, 6  # rounds of a search
+CERTAIN = 0.025  # of a standard error: two maxima so near to each other are known well enough
 FIRST = 0.1  # distance of the first points, relative to a parameter
 CLOSE = 0.2  # of a step, in distances of the points, that ends the search
 DISTANCE = 1.5  # of the points, in standard errors
@@ -28,20 +29,27 @@ SHIFT = 0.1  # between centres, in distances of the points: the jumps of tensor 
 _FACTOR = 3.0  # by which the distances change in a round, at most
 
 
-def usual_values(p: int, seeds: bool) -> tuple[int, int]:
-    """Return the fewest and the most values that a search in p parameters usually takes, those at its end among them."""
+def usual_values(p: int, seeds: bool, final: float = 1.0) -> tuple[float, float]:
+    """Return the fewest and the most values that a search in p parameters usually takes.
+
+    Each of those at its end counts as so many as `final` says.
+    """
     each = 1 + p + p * p  # of a quadratic
-    return (USUAL[0] * (1 + seeds) + SEEDS) * each, (USUAL[1] * (1 + seeds) + SEEDS) * each
+    return (USUAL[0] * (1 + seeds) + final * (SEEDS if seeds else FEWEST)) * each, (USUAL[1] * (1 + seeds) + final * SEEDS) * each
 
 
 class RandomMaximum(NamedTuple):
-    """The maximum (p,), the inverse of the negative Hessian (p, p), the random error of the maximum (p,), and how it ended."""
+    """The maximum (p,), the inverse of the negative Hessian (p, p), the random error of the maximum (p,), and how it ended.
+
+    `sets` is the number of sets of values, or of seeds, by which the error is known.
+    """
 
     values: Array
     covariance: Array
     errors: Array
     converged: bool
     iterations: int
+    sets: int
 
 
 def random_maximum(function: Callable[[Array, int], float], start: Array, box: Array, seeds: bool = True) -> RandomMaximum:
@@ -51,7 +59,8 @@ def random_maximum(function: Callable[[Array, int], float], start: Array, box: A
         function: the function of the parameters and the seed; without seeds, of what the values of one quadratic have in common.
         start: the parameters from which the search begins (p,).
         box: the bounds.
-        seeds: whether the values depend on the seed; else centres are shifted instead.
+        seeds: whether the values depend on the seed; else centres are shifted instead, and negative seeds are those of the
+            search, the values of which may be less accurate than those at its end.
     """
     centre = np.array(start, float)
     apart = np.maximum(FIRST * np.abs(centre), 0.5 * FIRST)
@@ -73,17 +82,21 @@ def random_maximum(function: Callable[[Array, int], float], start: Array, box: A
         apart = changed
         converged = settled and bool(np.all(np.abs(moved) <= CLOSE * apart) and np.all(curvature > 0))
     maxima, hessians = [], []
-    for seed in range(SEEDS):
-        own = centre if seeds else np.clip(centre + SHIFT * (seed - 0.5 * (SEEDS - 1)) * apart, box[:, 0], box[:, 1])
+    for seed, shift in zip(range(SEEDS), (-0.5, 0.5, -1.5, 1.5), strict=True):
+        own = centre if seeds else np.clip(centre + SHIFT * shift * apart, box[:, 0], box[:, 1])
         slope, H = _quadratic(lambda theta, seed=seed: function(theta, seed), own, apart, box)  # type: ignore[misc]
         maxima.append(own + _step(slope, H, apart))
         hessians.append(H)
+        if not seeds and len(maxima) == FEWEST:
+            curvature = -np.diag(np.mean(hessians, axis=0))
+            if np.all(curvature > 0) and np.all(np.ptp(maxima, axis=0) * np.sqrt(curvature) <= CERTAIN):
+                break
     H = np.mean(hessians, axis=0)
-    errors = np.std(maxima, axis=0, ddof=1) / np.sqrt(SEEDS)
+    errors = np.std(maxima, axis=0, ddof=1) / np.sqrt(len(maxima))
     values = np.clip(np.mean(maxima, axis=0), box[:, 0], box[:, 1])
     definite = bool(np.all(np.isfinite(H)) and np.linalg.eigvalsh(-H).min() > 0)
     covariance = np.linalg.inv(-H) if definite else np.full_like(H, np.nan)
-    return RandomMaximum(values, covariance, errors, converged and definite, rounds)
+    return RandomMaximum(values, covariance, errors, converged and definite, rounds, len(maxima))
 
 
 def _quadratic(function: Callable[[Array], float], centre: Array, apart: Array, box: Array) -> tuple[Array, Array]:
@@ -120,4 +133,4 @@ def sentence(names: Sequence[str], found: RandomMaximum, seeds: bool = True) -> 
     """Return how far the maximum is known."""
     known = ", ".join(f"{name} +- {error:.2g}" for name, error in zip(names, found.errors, strict=True))
     what, by = ("random errors", "seeds") if seeds else ("small jumps", "sets of values")
-    return f"the log-likelihood has {what}: by {SEEDS} {by} its maximum is known to {known}, beside the standard errors"
+    return f"the log-likelihood has {what}: by {found.sets} {by} its maximum is known to {known}, beside the standard errors"

@@ -5,6 +5,7 @@ An angle z with location h has the density  sum over k of p(z - h + 2 pi k)  on 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
 
 Array = NDArray[Any]
 TURN = 2.0 * np.pi
+ZERO: Array = np.zeros(())
 LINEAR = ("gaussian", "student-t")  # the families that an observed angle wraps
 _WIDE = 4.0  # variance from which a Fourier series is shorter than the images
 _HARMONICS = 5  # of that series: the next is exp(-36 * 4 / 2)
@@ -29,26 +31,33 @@ _IMAGES = 4  # of Student's law on each side; the rest is their integral, by the
 def observed_angles(model: Model) -> tuple[bool, ...]:
     """Return for every observation (m) whether it is an angle whose differences z - h are taken modulo 2 pi.
 
-    That is a sample with a Gaussian or Student's law whose observation is an `atan2(...)`, or whose name stands in the model key
-    `observed_angles`.
+    That is a sample with a Gaussian or Student's law whose observation is an `atan2(...)`, or a sum with one, such as a bearing
+    from a heading, or whose name stands in the model key `observed_angles`.
     """
     if model.observation_kind != "samples" or model.log_density is not None:
         return (False,) * model.m
     return tuple(
-        family in LINEAR and (isinstance(formula, sympy.atan2) or name in model.observed_angles)
+        family in LINEAR and (bool(_directions(formula)) or name in model.observed_angles)
         for family, formula, name in zip(model.observation_family, model.observation, model.observation_names, strict=True)
     )
+
+
+def _directions(formula: sympy.Expr) -> list[sympy.Expr]:
+    """Return the terms of a sum that are an atan2, with either sign."""
+    return [term for term in sympy.Add.make_args(formula) if isinstance(term, sympy.atan2) or isinstance(-term, sympy.atan2)]
 
 
 def without_branch(model: Model) -> list[sympy.Expr]:
     """Return formulas that are as smooth as the law of the observations: of an angle the arguments of atan2, without its jump."""
     found: list[sympy.Expr] = []
     for formula, angle in zip(model.observation, observed_angles(model), strict=True):
-        found.extend(formula.args if angle and isinstance(formula, sympy.atan2) else [formula])
+        directions = _directions(formula) if angle else []
+        found.extend(part for term in directions for part in (term if isinstance(term, sympy.atan2) else -term).args)
+        found.extend([] if formula in directions else [formula - sum(directions)])
     return found
 
 
-def nearest(values: Array, expected: Array, angles: Any) -> Array:
+def nearest(values: Array, expected: Array, angles: Array | Sequence[bool]) -> Array:
     """Return values (..., m) with each of the `angles` (m,) replaced by its image nearest to what is expected (..., m)."""
     angles = np.asarray(angles, bool)
     return np.where(angles, expected + wrap(values - expected), values) if angles.any() else values
@@ -84,27 +93,27 @@ class Wrapped:
         return np.isfinite(z)
 
     @staticmethod
-    def mode(h: Array, s: Any, shape: Any) -> Array:
+    def mode(h: Array, s: Array, shape: Array) -> Array:
         """Return the most probable value."""
         return h
 
     @staticmethod
-    def mean(h: Array, s: Any, shape: Any) -> Array:
+    def mean(h: Array, s: Array, shape: Array) -> Array:
         """Return the mean direction."""
         return h
 
-    def log_density(self, z: Any, h: Any, s: Any, shape: Any) -> Array:
+    def log_density(self, z: Array, h: Array, s: Array, shape: Array) -> Array:
         """Return the log density on (-pi, pi]."""
         apart = wrap(np.asarray(z) - h)
         if isinstance(self._family, StudentT):
             return _wrapped_student(apart, s, shape)
         return _wrapped_gaussian(apart, s)
 
-    def sample(self, rng: np.random.Generator, h: Array, s: Any, shape: Any) -> Array:
+    def sample(self, rng: np.random.Generator, h: Array, s: Array, shape: Array) -> Array:
         """Return one draw for each h, in (-pi, pi]."""
         return wrap(self._family.sample(rng, h, s, shape))
 
-    def cdf(self, z: Any, h: Any, s: Any, shape: Any) -> tuple[Array, Array]:
+    def cdf(self, z: Array, h: Array, s: Array, shape: Array) -> tuple[Array, Array]:
         """Return (twice) the probability of the angles from -pi to z."""
         z, h = wrap(np.asarray(z, float)), wrap(np.asarray(h, float))
         spread = np.sqrt(np.asarray(s, float))
@@ -124,7 +133,7 @@ class Wrapped:
         return value, value
 
 
-def _wrapped_gaussian(apart: Array, s: Any) -> Array:
+def _wrapped_gaussian(apart: Array, s: Array) -> Array:
     """Return the log density of N(0, s) modulo 2 pi at differences in (-pi, pi]."""
     s = np.asarray(s)
     wide = np.real(s) >= _WIDE
@@ -138,49 +147,49 @@ def _wrapped_gaussian(apart: Array, s: Any) -> Array:
     for k in range(1, count + 1):
         for turn in (TURN * k, -TURN * k):
             others = others + np.exp(-turn * (turn + 2.0 * apart) / (2.0 * narrow))
-    found = np.asarray(Gaussian.log_density(apart, 0.0, narrow, 0.0)) + np.log1p(others)
+    found = np.asarray(Gaussian.log_density(apart, ZERO, narrow, ZERO)) + np.log1p(others)
     return np.where(wide, _harmonics(apart, s), found) if np.any(wide) else found
 
 
-def _harmonics(apart: Array, s: Any) -> Array:
+def _harmonics(apart: Array, s: Array) -> Array:
     total: Array = np.zeros(np.broadcast_shapes(apart.shape, np.shape(s)))
     for k in range(1, _HARMONICS + 1):
         total = total + 2.0 * np.exp(-0.5 * k * k * s) * np.cos(k * apart)
     return np.asarray(np.log1p(total) - np.log(TURN))
 
 
-def _wrapped_student(apart: Array, s: Any, shape: Any) -> Array:
+def _wrapped_student(apart: Array, s: Array, shape: Array) -> Array:
     """Return the log density of Student's law with squared scale s modulo 2 pi at differences in (-pi, pi]."""
-    nearest_one = np.asarray(StudentT.log_density(apart, 0.0, s, shape))
+    nearest_one = np.asarray(StudentT.log_density(apart, ZERO, s, shape))
     others: Array = np.zeros(np.broadcast_shapes(apart.shape, np.shape(s), np.shape(shape)))
     for k in range(1, _IMAGES + 1):
         for turn in (TURN * k, -TURN * k):
-            others = others + np.exp(StudentT.log_density(apart + turn, 0.0, s, shape) - nearest_one)
+            others = others + np.exp(StudentT.log_density(apart + turn, ZERO, s, shape) - nearest_one)
     edge = TURN * (_IMAGES + 0.5)
     tails = _tail(edge + apart, s, shape) + _tail(edge - apart, s, shape)
     return nearest_one + np.log1p(others + tails * np.exp(-nearest_one))
 
 
-def _tail(x: Any, s: Any, shape: Any) -> Array:
+def _tail(x: Array, s: Array, shape: Array) -> Array:
     """Return the sum of the density at x + pi, x + 3 pi, ... for x > 0: int_x^oo p / 2 pi + 2 pi p'(x) / 24."""
-    density = np.exp(StudentT.log_density(x, 0.0, s, shape))
+    density = np.exp(StudentT.log_density(x, ZERO, s, shape))
     slope = -density * (shape + 1) * x / (shape * s + x**2)
     return np.asarray(_survival(x, s, shape) / TURN + TURN / 24.0 * slope)
 
 
-def _survival(x: Any, s: Any, shape: Any) -> Array:
+def _survival(x: Array, s: Array, shape: Array) -> Array:
     """Return P(X > x); complex arguments keep their derivatives."""
     from scipy.special import stdtr
 
     real = [np.real(value) for value in (x, s, shape)]
 
-    def at(x: Any, s: Any, shape: Any) -> Array:
+    def at(x: Array, s: Array, shape: Array) -> Array:
         return np.asarray(stdtr(shape, -x / np.sqrt(s)))
 
     value = at(*real)
     if not any(np.iscomplexobj(part) for part in (x, s, shape)):
         return value
-    density = np.exp(StudentT.log_density(real[0], 0.0, real[1], real[2]))
+    density = np.exp(StudentT.log_density(real[0], ZERO, real[1], real[2]))
     step = 1e-5 * real[2]
     by_shape = (at(real[0], real[1], real[2] + step) - at(real[0], real[1], real[2] - step)) / (2.0 * step)
     change = density * (-np.imag(x) + np.imag(s) * real[0] / (2.0 * real[1])) + by_shape * np.imag(shape)

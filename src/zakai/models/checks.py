@@ -173,12 +173,13 @@ def check_periodic(model: Model) -> None:
                 same = (np.abs(here - there) <= 1e-8 * (1 + np.abs(here))) | (~np.isfinite(here) & ~np.isfinite(there))
             if not same.all():
                 said = f"{str(expr)[:60]} is not 2*pi-periodic in {angle!r}, which is listed in periodic"
-                raise InputError(f"{place}: {said}; {_instead(model, place, expr, angle)}")
+                turns = bool(np.all(np.abs(np.sin(0.5 * (here - there))) <= 1e-8 * (1 + np.abs(here))))
+                raise InputError(f"{place}: {said}; {_instead(model, place, turns, angle)}")
 
 
-def _instead(model: Model, place: str, expr: sympy.Expr, angle: str) -> str:
-    """Return what to write instead of a formula that is not periodic."""
-    if place.startswith("observation[") and expr == model.x[model.state.index(angle)] and model.observation_kind == "samples":
+def _instead(model: Model, place: str, turns: bool, angle: str) -> str:
+    """Return what to write instead of a formula that is not periodic; `turns` says that it changes by whole turns."""
+    if place.startswith("observation[") and turns and model.observation_kind == "samples":
         return 'list the observation in observed_angles, or set observation_family = "von-mises"'
     return f"write it in cos({angle}) and sin({angle}), or leave {angle} out of periodic"
 

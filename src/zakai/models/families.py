@@ -35,23 +35,23 @@ class Family(Protocol):
         """Return where z is a possible value."""
 
     @staticmethod
-    def mode(h: Array, s: Any, shape: Any) -> Array:
+    def mode(h: Array, s: Array, shape: Array) -> Array:
         """Return the most probable value."""
 
     @staticmethod
-    def mean(h: Array, s: Any, shape: Any) -> Array:
+    def mean(h: Array, s: Array, shape: Array) -> Array:
         """Return the mean, or the mean direction of an angle."""
 
     @staticmethod
-    def log_density(z: Any, h: Any, s: Any, shape: Any) -> Array:
+    def log_density(z: Array, h: Array, s: Array, shape: Array) -> Array:
         """Return the log density, or the log mass of a count."""
 
     @staticmethod
-    def sample(rng: np.random.Generator, h: Array, s: Any, shape: Any) -> Array:
+    def sample(rng: np.random.Generator, h: Array, s: Array, shape: Array) -> Array:
         """Return one draw for each h."""
 
     @staticmethod
-    def cdf(z: Any, h: Any, s: Any, shape: Any) -> tuple[Array, Array]:
+    def cdf(z: Array, h: Array, s: Array, shape: Array) -> tuple[Array, Array]:
         """Return P(Z < z) and P(Z <= z)."""
 
 
@@ -63,11 +63,11 @@ class _Continuous:
         return np.isfinite(z)
 
     @staticmethod
-    def mode(h: Array, s: Any, shape: Any) -> Array:
+    def mode(h: Array, s: Array, shape: Array) -> Array:
         return h
 
     @staticmethod
-    def mean(h: Array, s: Any, shape: Any) -> Array:
+    def mean(h: Array, s: Array, shape: Array) -> Array:
         return h
 
 
@@ -77,15 +77,15 @@ class Gaussian(_Continuous):
     parameter, noise, support = None, True, "numbers"
 
     @staticmethod
-    def log_density(z: Any, h: Any, s: Any, shape: Any) -> Array:
+    def log_density(z: Array, h: Array, s: Array, shape: Array) -> Array:
         return np.asarray(-0.5 * ((z - h) ** 2 / s + np.log(2 * np.pi * s)))
 
     @staticmethod
-    def sample(rng: np.random.Generator, h: Array, s: Any, shape: Any) -> Array:
+    def sample(rng: np.random.Generator, h: Array, s: Array, shape: Array) -> Array:
         return h + np.sqrt(s) * rng.standard_normal(h.shape)
 
     @staticmethod
-    def cdf(z: Any, h: Any, s: Any, shape: Any) -> tuple[Array, Array]:
+    def cdf(z: Array, h: Array, s: Array, shape: Array) -> tuple[Array, Array]:
         from scipy.special import ndtr
 
         value = ndtr((z - h) / np.sqrt(s))
@@ -98,18 +98,18 @@ class StudentT(_Continuous):
     parameter, noise, support = "degrees_of_freedom", True, "numbers"
 
     @staticmethod
-    def log_density(z: Any, h: Any, s: Any, shape: Any) -> Array:
+    def log_density(z: Array, h: Array, s: Array, shape: Array) -> Array:
         from scipy.special import loggamma
 
         constant = _loggamma(loggamma, (shape + 1) / 2) - _loggamma(loggamma, shape / 2) - 0.5 * np.log(shape * np.pi * s)
         return np.asarray(constant - (shape + 1) / 2 * np.log(1 + (z - h) ** 2 / (shape * s)))
 
     @staticmethod
-    def sample(rng: np.random.Generator, h: Array, s: Any, shape: Any) -> Array:
+    def sample(rng: np.random.Generator, h: Array, s: Array, shape: Array) -> Array:
         return h + np.sqrt(s) * rng.standard_t(shape, h.shape)
 
     @staticmethod
-    def cdf(z: Any, h: Any, s: Any, shape: Any) -> tuple[Array, Array]:
+    def cdf(z: Array, h: Array, s: Array, shape: Array) -> tuple[Array, Array]:
         from scipy.special import stdtr
 
         value = stdtr(shape, (z - h) / np.sqrt(s))
@@ -126,15 +126,15 @@ class Poisson:
         return (z >= 0) & (z == np.floor(z)) & (z <= 2.0**53)
 
     @staticmethod
-    def mode(h: Array, s: Any, shape: Any) -> Array:
+    def mode(h: Array, s: Array, shape: Array) -> Array:
         return np.floor(h)
 
     @staticmethod
-    def mean(h: Array, s: Any, shape: Any) -> Array:
+    def mean(h: Array, s: Array, shape: Array) -> Array:
         return h
 
     @staticmethod
-    def log_density(z: Any, h: Any, s: Any, shape: Any) -> Array:
+    def log_density(z: Array, h: Array, s: Array, shape: Array) -> Array:
         from scipy.special import gammaln
 
         rate = _where_law(h, np.real(h) >= 0)
@@ -143,11 +143,11 @@ class Poisson:
         return np.asarray(np.where(impossible, -np.inf, term - rate - gammaln(np.asarray(z) + 1.0)))
 
     @staticmethod
-    def sample(rng: np.random.Generator, h: Array, s: Any, shape: Any) -> Array:
+    def sample(rng: np.random.Generator, h: Array, s: Array, shape: Array) -> Array:
         return rng.poisson(h).astype(float)
 
     @staticmethod
-    def cdf(z: Any, h: Any, s: Any, shape: Any) -> tuple[Array, Array]:
+    def cdf(z: Array, h: Array, s: Array, shape: Array) -> tuple[Array, Array]:
         from scipy.special import pdtr
 
         return np.where(np.asarray(z) > 0, pdtr(np.maximum(z - 1.0, 0.0), h), 0.0), pdtr(z, h)
@@ -163,24 +163,24 @@ class Bernoulli:
         return (z == 0) | (z == 1)
 
     @staticmethod
-    def mode(h: Array, s: Any, shape: Any) -> Array:
+    def mode(h: Array, s: Array, shape: Array) -> Array:
         return np.round(h)
 
     @staticmethod
-    def mean(h: Array, s: Any, shape: Any) -> Array:
+    def mean(h: Array, s: Array, shape: Array) -> Array:
         return h
 
     @staticmethod
-    def log_density(z: Any, h: Any, s: Any, shape: Any) -> Array:
+    def log_density(z: Array, h: Array, s: Array, shape: Array) -> Array:
         chance = _where_law(h, (np.real(h) >= 0) & (np.real(h) <= 1))
         return np.log(np.where(np.asarray(z) == 1, chance, 1.0 - chance))
 
     @staticmethod
-    def sample(rng: np.random.Generator, h: Array, s: Any, shape: Any) -> Array:
+    def sample(rng: np.random.Generator, h: Array, s: Array, shape: Array) -> Array:
         return (rng.uniform(size=h.shape) < h).astype(float)
 
     @staticmethod
-    def cdf(z: Any, h: Any, s: Any, shape: Any) -> tuple[Array, Array]:
+    def cdf(z: Array, h: Array, s: Array, shape: Array) -> tuple[Array, Array]:
         z = np.asarray(z)
         upto = np.where(z >= 1, 1.0, np.where(z >= 0, 1.0 - h, 0.0))
         return np.where(z > 1, 1.0, np.where(z > 0, 1.0 - h, 0.0)), upto
@@ -192,7 +192,7 @@ class VonMises(_Continuous):
     parameter, noise, support = "concentration", False, "angles in radians"
 
     @staticmethod
-    def log_density(z: Any, h: Any, s: Any, shape: Any) -> Array:
+    def log_density(z: Array, h: Array, s: Array, shape: Array) -> Array:
         from scipy.special import ive
 
         size = np.real(shape)
@@ -202,11 +202,11 @@ class VonMises(_Continuous):
         return np.asarray(shape * np.cos(z - h) - log_bessel - np.log(2 * np.pi))
 
     @staticmethod
-    def sample(rng: np.random.Generator, h: Array, s: Any, shape: Any) -> Array:
+    def sample(rng: np.random.Generator, h: Array, s: Array, shape: Array) -> Array:
         return rng.vonmises(np.mod(h + np.pi, 2 * np.pi) - np.pi, shape)
 
     @staticmethod
-    def cdf(z: Any, h: Any, s: Any, shape: Any) -> tuple[Array, Array]:
+    def cdf(z: Array, h: Array, s: Array, shape: Array) -> tuple[Array, Array]:
         from scipy.stats import vonmises
 
         angle = np.pi - np.mod(np.pi - np.asarray(z), 2 * np.pi)
@@ -225,15 +225,15 @@ class Binomial:
         return Poisson.inside(z)
 
     @staticmethod
-    def mode(h: Array, s: Any, shape: Any) -> Array:
+    def mode(h: Array, s: Array, shape: Array) -> Array:
         return np.minimum(np.floor((shape + 1.0) * h), shape)
 
     @staticmethod
-    def mean(h: Array, s: Any, shape: Any) -> Array:
+    def mean(h: Array, s: Array, shape: Array) -> Array:
         return shape * h
 
     @staticmethod
-    def log_density(z: Any, h: Any, s: Any, shape: Any) -> Array:
+    def log_density(z: Array, h: Array, s: Array, shape: Array) -> Array:
         from scipy.special import gammaln, xlogy
 
         chance = _where_law(h, (np.real(h) >= 0) & (np.real(h) <= 1))
@@ -249,11 +249,11 @@ class Binomial:
         return np.asarray(np.where(possible, found + ways, -np.inf + 0.0 * np.real(chance)))
 
     @staticmethod
-    def sample(rng: np.random.Generator, h: Array, s: Any, shape: Any) -> Array:
+    def sample(rng: np.random.Generator, h: Array, s: Array, shape: Array) -> Array:
         return rng.binomial(np.round(shape).astype(int), h).astype(float)
 
     @staticmethod
-    def cdf(z: Any, h: Any, s: Any, shape: Any) -> tuple[Array, Array]:
+    def cdf(z: Array, h: Array, s: Array, shape: Array) -> tuple[Array, Array]:
         from scipy.stats import binom
 
         return binom.cdf(np.asarray(z) - 1.0, shape, h), binom.cdf(z, shape, h)
@@ -269,15 +269,15 @@ class NegativeBinomial:
         return Poisson.inside(z)
 
     @staticmethod
-    def mean(h: Array, s: Any, shape: Any) -> Array:
+    def mean(h: Array, s: Array, shape: Array) -> Array:
         return h
 
     @staticmethod
-    def mode(h: Array, s: Any, shape: Any) -> Array:
+    def mode(h: Array, s: Array, shape: Array) -> Array:
         return np.floor(np.maximum(h * (1.0 - shape), 0.0))
 
     @staticmethod
-    def log_density(z: Any, h: Any, s: Any, shape: Any) -> Array:
+    def log_density(z: Array, h: Array, s: Array, shape: Array) -> Array:
         from scipy.special import gammaln, loggamma
 
         mean = _where_law(h, np.real(h) >= 0)
@@ -287,11 +287,11 @@ class NegativeBinomial:
         return np.asarray(np.where((np.real(mean) == 0) & (z > 0), -np.inf, ways + term - size * np.log(excess)))
 
     @staticmethod
-    def sample(rng: np.random.Generator, h: Array, s: Any, shape: Any) -> Array:
+    def sample(rng: np.random.Generator, h: Array, s: Array, shape: Array) -> Array:
         return rng.poisson(h * shape * rng.gamma(1.0 / shape, 1.0, h.shape)).astype(float)
 
     @staticmethod
-    def cdf(z: Any, h: Any, s: Any, shape: Any) -> tuple[Array, Array]:
+    def cdf(z: Array, h: Array, s: Array, shape: Array) -> tuple[Array, Array]:
         from scipy.stats import nbinom
 
         law = 1.0 / shape, 1.0 / (1.0 + shape * h)
@@ -312,24 +312,24 @@ class LogNormal(_Positive):
     parameter, noise, support = None, True, "positive numbers"
 
     @staticmethod
-    def mode(h: Array, s: Any, shape: Any) -> Array:
+    def mode(h: Array, s: Array, shape: Array) -> Array:
         return np.exp(h - s)
 
     @staticmethod
-    def mean(h: Array, s: Any, shape: Any) -> Array:
+    def mean(h: Array, s: Array, shape: Array) -> Array:
         return np.exp(h + 0.5 * s)
 
     @staticmethod
-    def log_density(z: Any, h: Any, s: Any, shape: Any) -> Array:
+    def log_density(z: Array, h: Array, s: Array, shape: Array) -> Array:
         log_z = np.log(np.where(z > 0, z, 1.0))
         return np.asarray(np.where(z > 0, Gaussian.log_density(log_z, h, s, shape) - log_z, -np.inf + 0.0 * np.real(h)))
 
     @staticmethod
-    def sample(rng: np.random.Generator, h: Array, s: Any, shape: Any) -> Array:
+    def sample(rng: np.random.Generator, h: Array, s: Array, shape: Array) -> Array:
         return np.exp(Gaussian.sample(rng, h, s, shape))
 
     @staticmethod
-    def cdf(z: Any, h: Any, s: Any, shape: Any) -> tuple[Array, Array]:
+    def cdf(z: Array, h: Array, s: Array, shape: Array) -> tuple[Array, Array]:
         with np.errstate(divide="ignore"):
             return Gaussian.cdf(np.log(np.maximum(z, 0.0)), h, s, shape)
 
@@ -344,24 +344,24 @@ class Exponential(_Positive):
         return np.isfinite(z) & (z >= 0)
 
     @staticmethod
-    def mode(h: Array, s: Any, shape: Any) -> Array:
+    def mode(h: Array, s: Array, shape: Array) -> Array:
         return np.zeros_like(h)
 
     @staticmethod
-    def mean(h: Array, s: Any, shape: Any) -> Array:
+    def mean(h: Array, s: Array, shape: Array) -> Array:
         return h
 
     @staticmethod
-    def log_density(z: Any, h: Any, s: Any, shape: Any) -> Array:
+    def log_density(z: Array, h: Array, s: Array, shape: Array) -> Array:
         mean = _where_law(h, np.real(h) > 0)
         return np.asarray(np.where(np.asarray(z) >= 0, -z / mean - np.log(mean), -np.inf))
 
     @staticmethod
-    def sample(rng: np.random.Generator, h: Array, s: Any, shape: Any) -> Array:
+    def sample(rng: np.random.Generator, h: Array, s: Array, shape: Array) -> Array:
         return h * rng.standard_exponential(h.shape)
 
     @staticmethod
-    def cdf(z: Any, h: Any, s: Any, shape: Any) -> tuple[Array, Array]:
+    def cdf(z: Array, h: Array, s: Array, shape: Array) -> tuple[Array, Array]:
         value = -np.expm1(-np.maximum(z, 0.0) / h)
         return value, value
 
@@ -382,11 +382,11 @@ PARAMETERS = tuple(dict.fromkeys(family.parameter for family in FAMILIES.values(
 COUNTS = ("poisson", "bernoulli", "binomial", "negative-binomial")
 
 
-def _where_law(values: Any, good: Any) -> Array:
+def _where_law(values: Array, good: Array) -> Array:
     return np.where(good, values, np.nan)
 
 
-def _loggamma(loggamma: Callable[[Any], Any], values: Any) -> Any:
+def _loggamma(loggamma: Callable[[Array], Array], values: Array) -> Array:
     """Return log Gamma; complex values keep a derivative."""
     from scipy.special import digamma
 

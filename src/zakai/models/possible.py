@@ -101,4 +101,4 @@ def _fault(model: Model, x: Any, t: float, u: Any, known: bool) -> str:
 def _lawless(name: str, location: float, shape: float) -> bool:
     """Return whether a family has no law with a location and a shape."""
     family = FAMILIES[name]
-    return bool(np.isnan(family.log_density(np.ones(()), np.float64(location), np.ones(()), np.float64(shape))))
+    return bool(np.isnan(family.log_density(np.ones(()), np.array(location), np.ones(()), np.array(shape))))

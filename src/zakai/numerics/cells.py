@@ -31,25 +31,21 @@ def grid_cells(log_values: Array, closed: bool, count: int) -> tuple[float, floa
         The ends of the window that holds the mass, as indices of the grid, and the averages (count,), up to a factor.  On a
         circle the window may go beyond the last index.
     """
+    out = np.empty(count)
+    if not closed:
+        return (*_line_cells(np.ascontiguousarray(log_values), out), out)
     values = np.exp(log_values - np.max(log_values))
     size = len(values)
-    if closed:
-        first, length = arc(values > SEEN)
-        start, terms = arc(values > _SUMMED)
-        low, high = first - 1.0, first + length + 0.0
-        if 2 * (high - low) > size:  # the whole circle, from the point opposite to the mean
-            mean = np.angle(values @ np.exp(2j * np.pi / size * np.arange(size))) * size / (2 * np.pi)
-            low, high = mean - 0.5 * size, mean + 0.5 * size
-            start, terms = 0, size
-    else:
-        seen, summed = np.flatnonzero(values > SEEN), np.flatnonzero(values > _SUMMED)
-        low, high = max(seen[0] - 1.0, -0.5), min(seen[-1] + 1.0, size - 0.5)
-        start, terms = int(summed[0]), int(summed[-1] - summed[0] + 1)
-    within = max(1, math.ceil(2.0 * (high - low) / count))  # two points for each of the grid
-    out, cell = np.empty(count), (high - low) / count
-    signed = np.take(values, np.arange(start, start + terms), mode="wrap") if closed else values[start : start + terms]
+    first, length = arc(values > SEEN)
+    start, terms = arc(values > _SUMMED)
+    low, high = first - 1.0, first + length + 0.0
+    if 2 * (high - low) > size:  # the whole circle, from the point opposite to the mean
+        mean = np.angle(values @ np.exp(2j * np.pi / size * np.arange(size))) * size / (2 * np.pi)
+        low, high = mean - 0.5 * size, mean + 0.5 * size
+        start, terms = 0, size
+    signed = np.take(values, np.arange(start, start + terms), mode="wrap")
     signed[1::2] *= -1.0
-    _interpolate(signed, size if closed else 0, start, low, cell, within, out)
+    _interpolate(signed, size, start, low, high, out)
     return low, high, out
 
 
@@ -62,15 +58,17 @@ def arc(inside: Array) -> tuple[int, int]:
 
 
 @kernel(
-    types.void(types.float64[::1], types.int64, types.int64, types.float64, types.float64, types.int64, types.float64[::1]),
+    types.void(types.float64[::1], types.int64, types.int64, types.float64, types.float64, types.float64[::1]),
     reordered=True,
 )
-def _interpolate(signed: Array, size: int, start: int, low: float, cell: float, within: int, out: Array) -> None:
-    """Write the averages over cells of the interpolant of the values (-1)^i `signed`[i] at the points `start` + i.
+def _interpolate(signed: Array, size: int, start: int, low: float, high: float, out: Array) -> None:
+    """Write averages over cells from `low` to `high`: of the interpolant of (-1)^i `signed`[i] at the points `start` + i.
 
     It is the sinc interpolant where the size is zero, else the trigonometric one of `size` values; those not given are zero.
     """
     count, closed = len(signed), size > 0
+    cell = (high - low) / len(out)
+    within = max(1, math.ceil(2.0 * cell))  # two points for each of the grid
     angles = np.pi / max(size, 1) * np.arange(count if closed else 0)
     cosines, sines = np.cos(angles), np.sin(angles)
     for r in range(len(out)):
@@ -98,6 +96,26 @@ def _interpolate(signed: Array, size: int, start: int, low: float, cell: float, 
             sine = math.sin(math.pi * rest) * (1.0 if int(nearest) % 2 == 0 else -1.0)
             total += sine / (size if closed else math.pi) * found
         out[r] = max(total / within, 0.0)
+
+
+@kernel(types.Tuple((types.float64, types.float64))(types.float64[::1], types.float64[::1]))
+def _line_cells(log_values: Array, out: Array) -> tuple[float, float]:
+    """Write the averages over cells for a grid on the line, and return the ends of the window, as `grid_cells` does."""
+    size, largest = len(log_values), np.max(log_values)
+    signed = np.empty(size)
+    start, stop, first, last = size, 0, size, 0
+    for i in range(size):
+        value = math.exp(log_values[i] - largest)
+        if value > _SUMMED:
+            start, stop = min(start, i), i + 1
+        if value > SEEN:
+            first, last = min(first, i), i
+        signed[i] = value
+    low, high = max(first - 1.0, -0.5), min(last + 1.0, size - 0.5)
+    signed = signed[start:stop]
+    signed[1::2] *= -1.0
+    _interpolate(signed, 0, start, low, high, out)
+    return low, high
 
 
 @kernel(

@@ -120,7 +120,8 @@ def _covariance(said: str, noise: str, letter: str, matrix: Any, model: Any) -> 
 
 def _letter(model: Any, usual: str) -> str:
     """Return the letter of a noise: the usual one, or a Greek one where the model has a name like it."""
-    names = {symbol.name for symbol in (*model.x, *model.parameter_symbols)} | set(getattr(model, "inputs", ()))
+    written = {symbol.name for symbol in (*model.x, *model.parameter_symbols)} | set(getattr(model, "inputs", ()))
+    names = written | {name.rstrip("0123456789_") for name in written}  # v1 is written as the first of several v
     choices = {"v": ("v", "β", "ξ"), "w": ("w", "η", "ζ"), "r": ("r", "ε", "ρ")}[usual]
     greek = {"β": "beta", "ξ": "xi", "η": "eta", "ζ": "zeta", "ε": "epsilon", "ρ": "rho"}
     return next(letter for letter in choices if not {letter, greek.get(letter)} & names or letter == choices[-1])
@@ -205,7 +206,8 @@ def _mathml(expression: Any) -> str:
     for symbol in expression.free_symbols:
         replaced[symbol] = sympy.Symbol(escape(symbol.name, quote=False), **symbol.assumptions0)
     for number in expression.atoms(sympy.Rational):
-        if number.q > _LARGEST_DENOMINATOR:  # 0.12345 says more than 2469/20000
+        # 0.4 as it is usually written, and 0.12345 instead of 2469/20000; 1/2 and 3/4 stay.
+        if (number.q % 5 == 0 and 10**4 % number.q == 0) or number.q > _LARGEST_DENOMINATOR:
             replaced[number] = sympy.Float(number)
     text = str(_Printer({"mat_delim": ""})._print(expression.xreplace(replaced)).toxml())
     return text.replace("<mo>&InvisibleTimes;</mo>", _SPACE).replace("<mo>-</mo>", "<mo>−</mo>")

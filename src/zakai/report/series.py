@@ -21,17 +21,11 @@ def thinned(values: np.ndarray, most: int = MOST_POINTS) -> np.ndarray:
     count = len(values)
     if count <= most:
         return np.arange(count)
-    bounds = np.linspace(0, count, most // 2 + 1).astype(int)
     low = np.where(np.isfinite(values), values, np.inf)
     high = np.where(np.isfinite(values), values, -np.inf)
-    if count >= 8 * most:  # parts of one length, all at once
-        size = -(-count // (most // 2))
-        whole = count - count % size
-        starts = np.arange(0, whole, size)
-        kept = np.concatenate(
-            [starts + low[:whole].reshape(-1, size).argmin(1), starts + high[:whole].reshape(-1, size).argmax(1)]
-        )
-        rest = [] if whole == count else [whole + int(np.argmin(low[whole:])), whole + int(np.argmax(high[whole:]))]
-        return np.unique(np.concatenate([kept, np.array(rest, dtype=int)]))
-    pairs = [(a + int(np.argmin(low[a:b])), a + int(np.argmax(high[a:b]))) for a, b in zip(bounds[:-1], bounds[1:], strict=True)]
-    return np.unique(np.array(pairs))
+    size = -(-count // (most // 2))
+    whole = count - count % size
+    starts = np.arange(0, whole, size)
+    kept = np.concatenate([starts + low[:whole].reshape(-1, size).argmin(1), starts + high[:whole].reshape(-1, size).argmax(1)])
+    rest = [] if whole == count else [whole + int(np.argmin(low[whole:])), whole + int(np.argmax(high[whole:]))]
+    return np.unique(np.concatenate([kept, np.array(rest, dtype=int)]))

@@ -20,7 +20,8 @@ from zakai.studio import pictures
 from zakai.studio.running import method_of, rows_of
 from zakai.studio.session import Answer, Held, Report, Session, state_of
 
-COARSE, FEW = 1e-2, 400  # tolerance, and most columns of the picture
+# The least tolerance, and times the method's own one where that is larger; and most columns of the picture.
+COARSE, COARSER, FEW = 1e-2, 3.0, 400
 WHOLE = 3_000  # rows that are filtered from the start; of more, those that are seen
 BEFORE = 200  # rows before the first that is seen, in which the start of a part is forgotten
 
@@ -49,9 +50,11 @@ def coarse(result: Any, method: str, options: dict[str, Any]) -> tuple[str, dict
     if method == "auto" and result.method in _registry.METHODS:
         method = result.method
     names = [method] if method in _registry.METHODS else [block.method for block in result.blocks]
-    if any("tolerance" in _registry.load(name).options for name in names if name in _registry.METHODS):
+    every = [_registry.load(name).options for name in names if name in _registry.METHODS]
+    if usual := [of["tolerance"] for of in every if "tolerance" in of]:
+        own = [COARSER * tolerance for tolerance in usual if tolerance is not None]
         given = options.get("tolerance")
-        options = {**options, "tolerance": max(COARSE, given) if isinstance(given, float) else COARSE}
+        options = {**options, "tolerance": max(COARSE, *own, given if isinstance(given, float) else 0.0)}
     return method, options
 
 

@@ -100,7 +100,9 @@ class Choices:
     standard error.  Index sets are not kept: those of one parameter do not interpolate what a change of another adds.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, coarser: float = 1.0) -> None:
+        """Keep choices, of runs with a tolerance that is as many times larger."""
+        self.coarser = coarser
         self.made: dict[tuple[tuple[str, ...], int], Made | Choice] = {}
 
 

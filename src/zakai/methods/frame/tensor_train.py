@@ -19,7 +19,7 @@ from zakai.records.schedule import Schedule
 
 FEW_STATES = 3
 TOLERANCES = (1e-3, 5e-3)  # of the mean in standard deviations, for two and three states and for more
-MOST_RANK = 24
+MOST_RANK, MOST_TOLERANCE = 24, 0.1
 
 
 def prepare(
@@ -40,9 +40,11 @@ def prepare(
         InputError: another value of an option.
     """
     default = TOLERANCES[model.n > FEW_STATES] if tolerance is None else tolerance
-    tolerance = real_number("tolerance", default, "a number from 1e-6 to 0.1", lambda value: 1e-6 <= value <= 0.1)
+    tolerance = real_number("tolerance", default, "a number from 1e-6 to 0.1", lambda value: 1e-6 <= value <= MOST_TOLERANCE)
     if not isinstance(choices, Choices | None):
         raise InputError("choices: expected what `fit` keeps of a run, or nothing")
+    if choices is not None:
+        tolerance = min(choices.coarser * tolerance, MOST_TOLERANCE)
     rank, system = whole_number("most_rank", most_rank, 2, 200), system_of(model)
     return Prepared(system, np.asarray(theta, float), schedule, tolerance, rank, None if system.kicked else choices)
 

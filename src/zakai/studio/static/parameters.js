@@ -12,7 +12,7 @@ export class Parameters {
     this.sliders = h("div", { class: "sliders" });
     this.fitted = h("div", { "data-testid": "fit-result" });
     this.drawn = h("div", {});
-    this.hint = h("p", { class: "small" }, "While a slider moves, what is seen is filtered with a tolerance of 0.01; when it is released, everything with the method's own.");
+    this.hint = h("p", { class: "small" }, "While a slider moves, what is seen is filtered coarsely; when it is released, everything with the method's own.");
     this.none = h("p", {}, "The model has no parameters. Name some in [parameters], and use them in the formulas.");
     this.tools = h("div", { class: "row" },
       h("button", { type: "button", "data-testid": "fit", onclick: () => this.fit() }, "Fit"),
