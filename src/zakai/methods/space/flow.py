@@ -28,8 +28,6 @@ MOST_LIFTED = 1e-4  # largest share of the maximum that counts as rounding when 
 class Stepper:
     """Substeps of one interval: flows around halves of the factor of a nonlinear h."""
 
-    exhausted = False
-
     def __init__(
         self,
         yau: YauSystem,

@@ -27,10 +27,10 @@ from zakai.models.features import CROSS_NOISE
 from zakai.models.model import Model
 from zakai.numerics.complex_step import is_complex
 from zakai.numerics.prior_grid import mixture_grid
-from zakai.numerics.space.advance import CHECKED, Control, advance
+from zakai.numerics.space.advance import CHECKED, VANISHED, Control, advance
 from zakai.numerics.space.field import NOTHING, Field, Report, positive, spline_error
 from zakai.numerics.space.grid import Grid
-from zakai.numerics.space.step import Stepper
+from zakai.numerics.space.step import ExhaustedError, Stepper
 from zakai.numerics.space.survey import Survey
 from zakai.numerics.space.update import Update, updated
 from zakai.numerics.space.window import MOST, Bounds
@@ -220,7 +220,10 @@ class Prepared:
             stepper = Stepper(observations.dynamics, bounds, self.tolerance, most_work)
             if steppers is not None:
                 steppers.append(stepper)
-            result, more, control = advance(stepper, result, start, length, potential, control, allowed / len(parts), least)
+            try:
+                result, more, control = advance(stepper, result, start, length, potential, control, allowed / len(parts), least)
+            except ExhaustedError:
+                return result, report.worst(VANISHED), Control(np.inf, 0.0, 0)
             if least >= MOST_PANELS:
                 more = more._replace(splitting=max(more.splitting, 1.0))
             if observations.system.state_dependent:  # mass where the noise has no value may be anywhere on the grid

@@ -75,7 +75,7 @@ def advance(
 ) -> tuple[Field, Report, Control]:
     """Return the density after the interval from t0 of length tau, with an error of the splitting of about `allowed`.
 
-    `least` is the number of substeps that resolve the coefficients' variation in time.  An exhausted stepper loses the density.
+    `least` is the number of substeps that resolve the coefficients' variation in time.
     """
     if tau <= 0:
         return field, NOTHING, control
@@ -89,7 +89,7 @@ def advance(
         for i in range(parts):
             before = field
             field, more = stepper.single(field, t0 + tau * i / parts, t0 + tau * (i + 1) / parts, potential)
-            if _vanished(field) or stepper.exhausted:
+            if _vanished(field):
                 return before, report.worst(VANISHED), Control(np.inf, 0.0, 0)
             field, spread = stepper.resolved(field, more)
             field = positive(field, stepper.bounds)
@@ -120,7 +120,7 @@ def _adaptively(
         if limit < end:
             end, length = limit, (limit - begin) / tau
         result, more, difference = stepper.double(field, begin, end, potential)
-        if _vanished(result) or stepper.exhausted:
+        if _vanished(result):
             return field, report.worst(VANISHED), Control(np.inf, 0.0, 0)
         work += result.values.size
         difference = min(difference, 10.0) if np.isfinite(difference) else 10.0
