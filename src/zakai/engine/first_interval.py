@@ -79,7 +79,8 @@ def _fault(setting: Setting, schedule: Schedule) -> str:
     except InputError as wrong:
         return f"not over the first interval: {wrong}"
     lost = any(not info.health.get(name, 0.0) <= limit for name, limit in method.losses.items())
-    lost = lost or not np.isfinite(info.mean).all()
+    # A train of the largest rank does not hold what comes next.
+    lost = lost or not np.isfinite(info.mean).all() or info.health.get("rank", 0.0) >= setting.options.get("most_rank", np.inf)
     work = work_of_step(method.name, model, info.health)
     if not lost and (work is None or work.seconds <= most_seconds(model, tolerance)):
         return ""
