@@ -40,7 +40,7 @@ STEP = 1e-3  # of these differences, in deviations of the prior
 MOST_OF_DENSITY, EDGE_OF_DENSITY = 4, 1e-6  # states of a prior by its log density, and the density where its grid ends
 # Seconds of one product of an evaluation of a train, and of all else in an observation; builds of a substep, points of an axis,
 # and builds for one column of a noise that depends on the state.  The expected work is `MARGIN` times what the expected rank
-# gives, as a rank that is 1.4 times the expected one makes it.
+# gives, or that of the first interval, as a rank that is 1.4 times as large makes it.
 PRODUCT, AROUND, MARGIN = 1.2e-8, 0.01, 3.0
 BUILDS, TRAIN_AXIS, KICK = 2.5, 30, 20
 MOST_STATES, MOST_RANK = 6, 24

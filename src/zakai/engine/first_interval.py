@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from zakai.algebra.expected_work import MOST_TIMES, most_points, most_seconds, work_of_step
+from zakai.algebra.expected_work import MARGIN, MOST_TIMES, most_points, most_seconds, work_of_step
 from zakai.algebra.order import GENERAL
 from zakai.engine.setting import Setting
 from zakai.errors import InputError
@@ -82,6 +82,6 @@ def _fault(setting: Setting, schedule: Schedule) -> str:
     # A train of the largest rank does not hold what comes next.
     lost = lost or not np.isfinite(info.mean).all() or info.health.get("rank", 0.0) >= setting.options.get("most_rank", np.inf)
     work = work_of_step(method.name, model, info.health)
-    if not lost and (work is None or work.seconds <= most_seconds(model, tolerance)):
+    if not lost and (work is None or MARGIN * work.seconds <= most_seconds(model, tolerance)):
         return ""
     return f"over the first interval it loses the density, or takes more than {MOST_TIMES:g} times the work of particles"
