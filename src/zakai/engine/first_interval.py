@@ -1,7 +1,7 @@
 """Whether a method holds a density over the first interval of a record, which "auto" asks before it takes the method.
 
-How much work a density on a grid needs depends on how far the drift moves and bends it between two observations, which a model
-does not tell.  The prior is advanced over the first interval of positive length with a bound on the work.  A record and an online
+The work of a density of several states depends on what the drift does to it between two observations, and a model does not say
+how long that is.  The prior is advanced over the first interval of positive length with a bound on the work.  A record and an online
 filter have that interval in common, and both choose by it; nothing is asked of what is observed.
 """
 

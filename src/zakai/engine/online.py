@@ -46,7 +46,8 @@ def online(
 
     Args:
         model: the system, with a prior.
-        method: a method's name, or "auto", as for `zakai.filter`.
+        method: a method's name, or "auto", as for `zakai.filter`. Of several states "auto" may take another method when the first
+            interval is known; an estimate at the model's start itself is then by the method before.
         inputs: the known inputs of the model that are known before; `update` takes later ones.
         unit: the model's unit of time, where times are dates, as for `zakai.Record`.
         origin: the date at which t = 0, with `unit`.
