@@ -370,3 +370,14 @@ def test_a_system_that_is_curved_over_the_density_warns_and_a_linear_one_does_no
     linear = zakai.filter(model("-x", "2*x"), record, "extended-kalman-bucy")
     assert np.nanmax(linear.health["linearisation"]) < 1e-12
     assert not any("linearis" in warning for warning in linear.warnings)
+
+
+def test_a_sample_at_the_start_of_a_system_with_inputs():
+    system = zakai.Model(
+        state=["x", "v"], drift=["v", "-x + u"], diffusion=[[0], [0.3]], observation=["x"], observation_kind="samples",
+        observation_noise=[[0.1]], inputs=["u"], prior={"kind": "gaussian", "mean": [0, 0], "cov": [1, 1]},
+    )  # fmt: skip
+    times = np.array([0.0, 0.4, 0.9])
+    record = zakai.Record(times, [0.3, 0.2, 0.1], "samples", inputs=zakai.Inputs(times, [0.0, 1.0, -1.0]))
+    found, exact = (zakai.filter(system, record, name) for name in ("extended-kalman-bucy", "kalman-bucy"))
+    assert np.allclose(found.mean, exact.mean, atol=1e-9) and found.log_likelihood == pytest.approx(exact.log_likelihood, abs=1e-9)

@@ -222,12 +222,19 @@ def test_differences_of_the_evidence_are_right_where_runs_have_their_choices_in_
         assert abs(found - (log_likelihood(1.0 + apart, "yau-yau") - exact)) < 3e-4
 
 
-def test_a_lost_track_ends_with_a_sentence_that_gives_the_time_and_another_method():
+def test_a_lost_track_ends_with_a_sentence_that_gives_the_time_and_another_method(monkeypatch):
+    from zakai.methods.frame import filter as frame
+
     model = track(observation=["sqrt(px**2 + py**2)", "atan2(py, px)"])
     times, values = np.array([0.2, 0.5, 0.9]), np.array([[8.0, 0.4], [9000.0, 2.5], [8.0, 0.4]])
     result = zakai.filter(model, zakai.Record(times, values, "samples"), "tensor-train", tolerance=2e-2)
     (said,) = [words for words in result.warnings if "the density was lost" in words]
     assert "at t = 0.5:" in said and said.endswith("take guided-particles")
+    steps = []
+    monkeypatch.setattr(frame, "_step", lambda *arguments, step=frame._step: steps.append(arguments) or step(*arguments))
+    transforms = result.residuals()
+    assert np.isfinite(transforms[0]).all() and np.isnan(transforms[1:, 1]).all()
+    assert len(steps) < 12  # what is lost is not integrated over
 
 
 def test_ranks_at_their_limit_do_not_ask_for_substeps_and_the_error_does_not_grow():

@@ -334,6 +334,13 @@ def test_the_script_of_a_record_with_dates_and_another_time_column_computes_the_
     assert page.ask("describe", text=text, data=wrong)["error"].startswith("mine.csv: row 4: 'much'")
 
 
+@pytest.mark.parametrize(("step", "unit"), [("0.3", "s"), ("300", "min"), ("3600", "h"), ("86400", "d"), ("0.002", "ms")])
+def test_the_unit_of_dates_suits_the_distances_of_the_rows(page: Page, step: str, unit: str):
+    dates = np.datetime64("2024-01-01", "ns") + (np.arange(5) * float(step) * 1e9).astype("timedelta64[ns]")
+    number = page.upload(("time,y\n" + "".join(f"{str(date)[:26]},1\n" for date in dates)).encode()).json()["file"]
+    assert page.ask("columns", kind="file", file=number, name="mine.csv")["unit"] == unit
+
+
 TABLED = """state = ["x"]  # of my own
 drift = ["-x"]
 observation = ["gain(x)"]

@@ -220,7 +220,7 @@ class PredictiveSums:
         covs = self.noise(np.zeros(model.n), t, self.theta, inputs) + slopes @ mixture.covs @ np.swapaxes(slopes, 1, 2)
         return _gaussian(which, values - self.h(points, t, self.theta, inputs), covs)
 
-    def _samples_drawn(self, k: int, which: Array, mixture: Mixture, state: Any, values: Array) -> Pair | None:
+    def _samples_drawn(self, k: int, which: Array, mixture: Mixture, state: Any, values: Array) -> Pair:
         """Return the law of samples from the predicted state and draws of it; each coordinate updates the state for the next."""
         method, below, upto = self.setting.method, np.full(len(values), np.nan), np.full(len(values), np.nan)
         for count, j in enumerate(which):
@@ -231,9 +231,7 @@ class PredictiveSums:
                 assert updated is not None
                 mixture = updated
             _, *pair = self._samples_at(k, which[: count + 1], mixture.points, values)
-            below[j], upto[j] = (mixture.weights @ side[:, j] for side in pair)
-            if not np.isfinite(upto[j]):
-                return None
+            below[j], upto[j] = (mixture.weights @ side[:, j] for side in pair)  # NaN where the density is lost
         return below, upto
 
     def noise_at(self, k: int, which: Array, mixture: Mixture) -> Array:

@@ -1,8 +1,8 @@
 """Whether a method holds a density over the first interval of a record, which "auto" asks before it takes the method.
 
 The work of a density of several states depends on what the drift does to it between two observations, and a model does not say
-how long that is.  The prior is advanced over the first interval of positive length with a bound on the work.  A record and an online
-filter have that interval in common, and both choose by it; nothing is asked of what is observed.
+how long that is.  The prior is advanced over the first interval of positive length with a bound on the work.  A record and an
+online filter have that interval in common, and both choose by it; what is observed has no influence.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ class FirstInterval(NamedTuple):
             return ""
         nothing = np.zeros((1, model.m))
         inputs = self.inputs if model.inputs else None
-        schedule = Schedule(np.array([float(model.start)]), np.array([self.stop]), nothing > 0, nothing, inputs)
+        schedule = Schedule(np.array([float(model.start)]), np.array([self.stop]), nothing > 0, nothing, inputs).part(slice(1))
         if setting.prior is not model.prior:
             return _fault(setting, schedule)
         key = (method.name, tuple(sorted(setting.options.items())), setting.theta.tobytes(), *schedule.key())

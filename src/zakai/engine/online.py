@@ -162,7 +162,7 @@ class Online:
         return moments
 
     def _with_methods(self, names: Any) -> Plan:
-        """Return the plan of "auto" that takes these methods for the blocks, as far as they hold; any other where they do not."""
+        """Return the plan of "auto" that takes these methods for the blocks; any other where they do not hold."""
         listed = names if isinstance(names, list) and len(names) == len(self.blocks) else [""] * len(self.blocks)
         wanted = {id(block.model): name for block, name in zip(self.blocks, listed, strict=True)}
 

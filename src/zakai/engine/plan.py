@@ -183,7 +183,7 @@ def _fault_at_prior(setting: Setting) -> str:
 def _own_options(methods: Sequence[Method[Any, Any]], options: Mapping[str, Any]) -> list[dict[str, Any]]:
     """Return the options of each method: its defaults, updated by those given that it has."""
     for name in sorted(options):
-        if not any(name in method.options for method in methods):
+        if not any(name in method.all_options for method in methods):
             what = " and ".join(method.name for method in methods)
             known = sorted({option for method in methods for option in method.options})
             listed = f"the options are {', '.join(known)}" if known else "there is no option"
@@ -191,5 +191,6 @@ def _own_options(methods: Sequence[Method[Any, Any]], options: Mapping[str, Any]
                 raise InputError(f'{what} has no option "{name}"; {listed}')
             raise InputError(f'none of {what} has an option "{name}"; {listed}')
     return [
-        {**method.options, **{name: value for name, value in options.items() if name in method.options}} for method in methods
+        {**method.all_options, **{name: value for name, value in options.items() if name in method.all_options}}
+        for method in methods
     ]

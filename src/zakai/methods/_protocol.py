@@ -267,3 +267,8 @@ class Method(Generic[P, S]):
     backward: Backward[P, S, Any] | None = None
     reduced: Callable[[S], S] | None = None
     bounded: Callable[[P, float], P] | None = None
+
+    @property
+    def all_options(self) -> dict[str, Any]:
+        """The options with their defaults, and `choices`, which a fit alone gives."""
+        return {**self.options, **({} if self.by_values is None else {"choices": None})}

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import sympy
+from numpy.typing import NDArray
 
 from zakai.errors import InputError
 from zakai.models._program import Program, operations
@@ -14,10 +15,11 @@ from zakai.models._program import Program, operations
 if TYPE_CHECKING:
     from zakai.models.model import Model
 
-NumericFunction = Callable[..., np.ndarray]
+Array = NDArray[Any]
+NumericFunction = Callable[..., Array]
 
 
-def _erf(x: Any) -> Any:
+def _erf(x: Array) -> Array:
     # Few models have one, and every command would wait for SciPy.
     from scipy.special import erf
 
@@ -27,38 +29,38 @@ def _erf(x: Any) -> Any:
 REAL = operations(np, _erf)
 
 
-def _inexact(values: Any) -> np.ndarray:
+def _inexact(values: Array) -> Array:
     values = np.asarray(values)
     return values if values.dtype == complex else np.asarray(values, dtype=float)
 
 
-def _sign(values: Any) -> Any:
+def _sign(values: Array) -> Array:
     return np.sign(np.real(values))
 
 
-def _absolute(values: Any) -> Any:
+def _absolute(values: Array) -> Array:
     return np.where(np.real(values) < 0, -values, values)
 
 
-def _complex_erf(values: Any) -> Any:
+def _complex_erf(values: Array) -> Array:
     slope = 2.0 / np.sqrt(np.pi) * np.exp(-(np.real(values) ** 2))
     return _erf(np.real(values)) + 1j * slope * np.imag(values)
 
 
-def _complex_log_cosh(values: Any) -> Any:
+def _complex_log_cosh(values: Array) -> Array:
     size = _absolute(values)
     return size + np.log1p(np.exp(-2.0 * size)) - np.log(2.0)
 
 
-def _chosen(first: Any, second: Any, choose_first: Any) -> Any:
+def _chosen(first: Array, second: Array, choose_first: Array) -> Array:
     return np.where(choose_first | np.isnan(np.real(first)), first, second)
 
 
-def _complex_log1p(values: Any) -> Any:
+def _complex_log1p(values: Array) -> Array:
     return np.log1p(np.real(values)) + 1j * np.imag(values) / (1.0 + np.real(values))
 
 
-def _complex_atan2(y: Any, x: Any) -> Any:
+def _complex_atan2(y: Array, x: Array) -> Array:
     size = np.real(x) ** 2 + np.real(y) ** 2
     return np.arctan2(np.real(y), np.real(x)) + 1j * (np.imag(y) * np.real(x) - np.imag(x) * np.real(y)) / size
 

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from zakai.models.model import Model
 
 Array = NDArray[Any]
+Law = tuple[Array, Array, Array, Array]  # z, location, variance and shape of a coordinate
 _DRAW_POINTS = 4001  # of the grid on which an observation is drawn from a log density
 
 
@@ -55,12 +56,12 @@ class ObservationLaw:
     def _log_density(self) -> Callable[..., Array]:
         return numpy_function([self._model.log_density], self._model, ())
 
-    def parameters(self, x: Any, t: Any, theta: Any, u: Any = None) -> tuple[Array, Array, Array]:
+    def parameters(self, x: Array, t: Array | float, theta: Array, u: Array | None = None) -> tuple[Array, Array, Array]:
         """Return h (..., m), S (..., m, m) and the shapes of the families (..., m), zero where there is none."""
         h, S, shapes = (function(x, t, theta, u) for function in self._functions)
         return h, S if self._coupled else S[..., None] * np.eye(S.shape[-1]), shapes
 
-    def log_density(self, values: Any, x: Any, t: Any, theta: Any, u: Any = None) -> Array:
+    def log_density(self, values: Array, x: Array, t: Array | float, theta: Array, u: Array | None = None) -> Array:
         """Return log p(z | x, u, t) of one row at many points.
 
         Args:
@@ -82,7 +83,7 @@ class ObservationLaw:
         density = self._log_density(x, t, theta, u, np.where(seen, values, 0.0))
         return np.where(seen.all(axis=-1), density, 0.0)
 
-    def terms(self, values: Any, x: Any, t: Any, theta: Any, u: Any = None) -> Array:
+    def terms(self, values: Array, x: Array, t: Array | float, theta: Array, u: Array | None = None) -> Array:
         """Return the log densities (..., m) of the coordinates, each given those before it; they add up to `log_density`."""
         values = np.asarray(values, dtype=float)
         seen = ~np.isnan(values)
@@ -90,7 +91,7 @@ class ObservationLaw:
         terms = [law.log_density(*part) for law, part in zip(self._laws, parts, strict=True)]
         return np.where(seen, np.stack(np.broadcast_arrays(*terms), axis=-1), 0.0)
 
-    def largest(self, seen: Array, x: Any, t: Any, theta: Any, u: Any = None) -> Array:
+    def largest(self, seen: Array, x: Array, t: Array | float, theta: Array, u: Array | None = None) -> Array:
         """Return the log density (...) of the most probable row at many points, of the coordinates `seen` (..., m).
 
         Raises:
@@ -106,7 +107,7 @@ class ObservationLaw:
         terms = [law.log_density(*part) for law, part in zip(self._laws, parts, strict=True)]
         return np.sum(np.where(seen, np.stack(terms, axis=-1), 0.0), axis=-1)
 
-    def cdf(self, values: Any, x: Any, t: Any, theta: Any, u: Any = None) -> tuple[Array, Array]:
+    def cdf(self, values: Array, x: Array, t: Array | float, theta: Array, u: Array | None = None) -> tuple[Array, Array]:
         """Return P(Z_j < z_j) and P(Z_j <= z_j) (..., m) given the coordinates before; NaN where nothing is observed.
 
         Raises:
@@ -121,29 +122,29 @@ class ObservationLaw:
         below, upto = (np.stack(np.broadcast_arrays(*side), axis=-1) for side in zip(*pairs, strict=True))
         return np.where(seen, below, np.nan), np.where(seen, upto, np.nan)
 
-    def mean(self, x: Any, t: Any, theta: Any, u: Any = None) -> Array:
+    def mean(self, x: Array, t: Array | float, theta: Array, u: Array | None = None) -> Array:
         """Return the means (..., m) of the coordinates given the state, of an angle the mean direction."""
         h, S, shape = (function(x, t, theta, u) for function in self._functions)
         variance = np.diagonal(S, axis1=-2, axis2=-1) if self._coupled else S
         laws = zip(self._laws, *(np.moveaxis(part, -1, 0) for part in (h, variance, shape)), strict=True)
         return np.stack(np.broadcast_arrays(*(own.mean(*law) for own, *law in laws)), axis=-1)
 
-    def _parts(self, values: Array, x: Any, t: Any, theta: Any, u: Any) -> list[tuple[Any, Any, Any, Any]]:
+    def _parts(self, values: Array, x: Array, t: Array | float, theta: Array, u: Array | None) -> list[Law]:
         """Return for every coordinate z, location, variance and shape, given the coordinates before it."""
         return self._conditional(values, *(function(x, t, theta, u) for function in self._functions))
 
-    def _conditional(self, values: Array, h: Array, S: Array, shape: Array) -> list[tuple[Any, Any, Any, Any]]:
+    def _conditional(self, values: Array, h: Array, S: Array, shape: Array) -> list[Law]:
         seen = ~np.isnan(values)
         z = np.where(seen, values, 0.0)
         if not self._coupled:
             return [(z[..., j], h[..., j], S[..., j], shape[..., j]) for j in range(len(self.families))]
         # By Cholesky's factor F of S among the observed: the mean of z_j given z_1, ..., z_(j-1) is h_j + sum_i F_ji w_i.
-        parts: list[tuple[Any, Any, Any, Any]] = []
-        columns: list[list[Any]] = []
-        whitened: list[Any] = []
+        parts: list[Law] = []
+        columns: list[list[Array]] = []
+        whitened: list[Array] = []
         for j in range(len(self.families)):
             row = [np.where(seen[..., j] & seen[..., i], S[..., j, i], 0.0) for i in range(j)]
-            factors: list[Any] = []
+            factors: list[Array] = []
             for i in range(j):
                 rest = row[i] - sum((factors[k] * columns[i][k] for k in range(i)), np.zeros(()))
                 factors.append(rest / columns[i][i])
@@ -156,7 +157,7 @@ class ObservationLaw:
             whitened.append(np.where(seen[..., j], apart / deviation, 0.0))
         return parts
 
-    def sample(self, rng: np.random.Generator, x: Array, t: Any, theta: Any, u: Any = None) -> Array:
+    def sample(self, rng: np.random.Generator, x: Array, t: Array | float, theta: Array, u: Array | None = None) -> Array:
         """Return one draw (K, m) for each of the states x (K, n) at times t (K,).
 
         Raises:
@@ -191,7 +192,7 @@ class ObservationLaw:
             f"the family {name} has no such law at {point}; check its mean, its noise and its parameter there"
         )
 
-    def _sample_log_density(self, rng: np.random.Generator, x: Array, t: Any, theta: Any, u: Any) -> Array:
+    def _sample_log_density(self, rng: np.random.Generator, x: Array, t: Array | float, theta: Array, u: Array | None) -> Array:
         """Draw one coordinate by its distribution function on a grid that is fitted to all states together."""
         if len(self.families) > 1:
             raise InputError("observation_log_density: draws of several coordinates are not supported; give one")

@@ -75,6 +75,14 @@ def unit_name(unit: Any, what: str = "record") -> str:
     return name
 
 
+def usual_unit(dates: np.ndarray) -> str:
+    """Return a unit in which dates (K,) may be counted, up to days: the largest that is at most ten of their median distances."""
+    apart = np.diff(np.sort(dates[~np.isnat(dates)])).astype(np.int64)
+    median = float(np.median(apart[apart > 0])) if (apart > 0).any() else float(_NANOSECONDS["h"])
+    return max((name for name in _NANOSECONDS if _NANOSECONDS[name] <= min(max(10.0 * median, 1.0), _NANOSECONDS["d"])),
+               key=lambda name: _NANOSECONDS[name])  # fmt: skip
+
+
 def as_dates(values: Any) -> np.ndarray | None:
     """Return dates as datetime64[ns], in UTC where they have a time zone; None where these are no dates.
 

@@ -129,6 +129,8 @@ def first_moment(result: Any) -> str:
 
 def estimate(result: Any) -> str:
     """Return a sentence with the first states at the end, each with its deviation."""
+    if not np.isfinite(np.asarray(result.mean)[-1]).all():
+        return "At the end there is no estimate: the density was lost. "
     names, deviation = state_names(result), np.sqrt(np.maximum(np.asarray(result.variance)[-1], 0.0))
     few = [f"{name} = {signed(f'{mean:.4g}')} ± {width:.2g}" for name, mean, width in zip(names, result.mean[-1], deviation)][:3]
     more = f" (the first 3 of {len(names)} states)" if len(names) > 3 else ""
@@ -148,9 +150,9 @@ def verdict(result: Any) -> str:
         text += f" forecast {count(observations, 'time')} without observations"
     else:
         total = signed(f"{result.log_likelihood:,.2f}")
-        done = "smoothed" if kind_of(result) == "smoothed" else "filtered"
-        text += f" {done} {count(observations, 'observation')} with a log-likelihood of {total}"
-        if observations:
+        done, known = "smoothed" if kind_of(result) == "smoothed" else "filtered", np.isfinite(result.log_likelihood)
+        text += f" {done} {count(observations, 'observation')} {f'with a log-likelihood of {total}' if known else 'in part'}"
+        if observations and known:
             text += f" ({signed(f'{result.log_likelihood / observations:.3f}')} per observation)"
     warned = len(result.warnings)
     text += f"; it raised {count(warned, 'warning')}, below." if warned else "; it raised no warning."

@@ -15,7 +15,7 @@ from zakai.models.clock import clock
 from zakai.models.model import Model
 from zakai.records import Inputs, Record, Truth, read_truth
 from zakai.records.csv import Dates, clock_of, read_table
-from zakai.records.dates import date_of
+from zakai.records.dates import date_of, usual_unit
 from zakai.records.dialect import dialect_of
 from zakai.records.header import cells_of, header_of
 from zakai.records.numbers import NUMBER
@@ -24,7 +24,8 @@ from zakai.studio.time_column import with_time
 
 MOST_ROWS, MOST_COLUMNS = 1_000_000, 200
 MOST_SIMULATED = 200_000  # observations that are drawn on demand
-PREVIEWED, MOST_DRAWN = 6, 2_000  # rows of a file that are shown, and points of a column that are drawn
+# Rows of a file that are shown, those of which the dates say the unit of time, and points of a column that are drawn.
+PREVIEWED, JUDGED, MOST_DRAWN = 6, 200, 2_000
 _IDENTIFIER = re.compile(r"[0-9a-f]{32}")
 
 
@@ -141,7 +142,7 @@ def _column(names: list[str], column: Any, name: str) -> int:
 
 
 def columns_of(request: Mapping[str, Any], folder: Path) -> dict[str, Any]:
-    """Return the names of the columns of a file, its first rows, and whether its times are dates."""
+    """Return the names of the columns of a file, its first rows, whether its times are dates, and a unit for them."""
     path = file_of(request, folder)
     name = str(request.get("name") or "the record")[:80]
     names = header_of(path)
@@ -155,12 +156,15 @@ def columns_of(request: Mapping[str, Any], folder: Path) -> dict[str, Any]:
     rows: list[list[str]] = []
     if dialect is not None:
         after = dialect.translated(lines[dialect.line :])
-        rows = [[cell.strip()[:24] for cell in cells_of(line)] for line in after if line.strip()][:PREVIEWED]
+        rows = [[cell.strip() for cell in cells_of(line)] for line in after if line.strip()][:JUDGED]
     if all(NUMBER.fullmatch(one) for one in names):
         raise InputError(f"{name}: has no header; its first line must be names, one of them the time's")
     dated = bool(rows) and date_of(rows[0][0].strip('"')) is not None
+    dates = [date for row in rows if (date := date_of(row[0].strip('"'))) is not None]
+    unit = usual_unit(np.array(dates, "datetime64[ns]")) if dated else None
+    rows = [[cell[:24] for cell in row] for row in rows[:PREVIEWED]]
     every = header_of(file_of({**request, "time": None}, folder))
-    return {"columns": names, "every": every, "rows": rows, "dated": dated, "timed": names[0] == "time"}
+    return {"columns": names, "every": every, "rows": rows, "dated": dated, "unit": unit, "timed": names[0] == "time"}
 
 
 def described(model: Model, found: Given) -> tuple[dict[str, Any], dict[str, np.ndarray]]:

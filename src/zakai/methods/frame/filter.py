@@ -167,6 +167,8 @@ def step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[State
     def check(infinity: bool) -> None:
         check_escape(prepared, k, lambda: state.train(prepared.system.periods).moments(), infinity)
 
+    if np.isnan(state.cores[0]).any():  # a density that is lost stays lost
+        return _lost(state)
     check(infinity=False)
     try:
         after, lost = _step(prepared, k, state, values)
@@ -175,11 +177,14 @@ def step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[State
         return after
     except (Unresolved, np.linalg.LinAlgError):
         check(infinity=True)
-        n = prepared.model.n
-        health = dict.fromkeys(FIGURES, math.nan)
-        # A density that is lost stays lost.
-        state = state._replace(cores=tuple(np.full_like(core, math.nan) for core in state.cores))
-        return state, Info(math.nan, np.full(n, math.nan), np.full((n, n), math.nan), health)
+        return _lost(state)
+
+
+def _lost(state: State) -> tuple[State, Info]:
+    """Return a state whose density is lost, and its report."""
+    n = len(state.cores)
+    state = state._replace(cores=tuple(np.full_like(core, math.nan) for core in state.cores))
+    return state, Info(math.nan, np.full(n, math.nan), np.full((n, n), math.nan), dict.fromkeys(FIGURES, math.nan))
 
 
 def _step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[tuple[State, Info], float]:

@@ -74,7 +74,7 @@ METHOD: Method[Prepared, State] = Method(
     exactness="convergent: tensor trains of quintic B-splines in a frame that follows the density; of second order in a substep, "
     "whose error is measured by points",
     theorem=theorem,
-    options={"tolerance": None, "most_rank": MOST_RANK, "choices": None},
+    options={"tolerance": None, "most_rank": MOST_RANK},
     prepare=prepare,
     init=init,
     step=step,

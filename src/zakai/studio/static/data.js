@@ -139,7 +139,7 @@ export class Data {
       this.wrong("Choose the column of the time.", "columns to choose");
       return;
     }
-    if (found.dated && !data.unit) this.studio.state.data = { ...data, unit: "h" };
+    if (found.dated && !data.unit) this.studio.state.data = { ...data, unit: found.unit };
     this._mapping();
     this.changed(fresh);
   }

@@ -47,7 +47,7 @@ def loop_of(
     if programs is None:
         return None
     lengths = parts.stops - parts.starts
-    rates = parts.change / lengths[:, None]
+    rates = parts.change / np.where(lengths > 0, lengths, 1.0)[:, None]  # an interval of length zero ends at a sample at the start
     each = tuple(np.array(part, float, order="C") for part in (parts.starts, lengths, parts.first, rates, rate_noise))
     kinds = (float, float, float, bool, bool, float, float)
     return Loop(
