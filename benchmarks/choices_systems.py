@@ -56,6 +56,13 @@ def _current(t: np.ndarray) -> list[np.ndarray]:
 
 
 _CELL = "3.2 + 0.8*soc + 0.15*tanh(10*(soc - 0.9)) - 0.3*exp(-20*soc) - v1{} - 0.02*I"
+def _log_normal(means: dict[str, float], sd: float) -> dict[str, str]:
+    """Return the prior of positive states whose logarithms are Gaussian."""
+    parts = [f"-(log({name}) - ({mean}))**2/(2*{sd}**2) - log({name})" for name, mean in means.items()]
+    return {"kind": "density", "log_density": " ".join(parts)}
+
+
+_POSITIVE = {"x": {"lower": 0.0}, "y": {"lower": 0.0}}
 _OSCILLATORS = ["u", "-q - 0.3*q**3 + 0.5*(r - q) - 0.1*u", "w", "-2*r + 0.5*(q - r) - 0.1*w"]
 _L96 = [f"(x{(i + 1) % 6} - x{(i - 2) % 6})*x{(i - 1) % 6} - x{i} + 8" for i in range(6)]
 
@@ -89,6 +96,22 @@ SYSTEMS: dict[str, System] = {
                    [2, 0], [2, 2], 0.5),
     "car": system("p v", ["v", "-0.8*cos(p/2) - 0.1*v*abs(v) + 1"], {"v": "0.5"}, ["4*sin(p/2) + p/10"], [0.09], [0, 2], [4, 0.5],
                   0.3),
+    "relaxation": system("x v", ["v", "50*(1 - x**2)*v - x"], {"v": "0.5"}, ["x"], [0.01], [1.5, 0], [0.1, 0.1], 0.3, rows=16),
+    "tanks": system("a b", ["0.05 - 0.2*sqrt(abs(a))", "0.2*sqrt(abs(a)) - 0.2*sqrt(abs(b))"], {"a": "0.01", "b": "0.01"}, ["b"],
+                    [1e-4], [0.1, 0.1], [0.01, 0.01], 2.0, rows=16),
+    "friction": system("w i", ["5*i - 0.5*w - 2*tanh(w/0.02)", "20*(u - i - 0.2*w)"], {"w": "0.3", "i": "0.3"}, ["w"], [0.01],
+                       [0, 0], [0.5, 0.2], 0.1, rows=16, inputs=["u"], inputs_at=lambda t: [np.sin(2 * t)]),
+    "predators": system("x y", ["x - 0.5*x*y", "0.4*x*y - 0.6*y"], {"x": "0.15*x", "y": "0.15*y"}, ["x", "y"], [0.04, 0.04], [],
+                        [], 0.5, rows=16, domain=_POSITIVE, prior=_log_normal({"x": 0.7, "y": 0.7}, 0.2)),
+    "brusselator": system("x y", ["1 - 4*x + x**2*y", "3*x - x**2*y"], {"x": "0.1", "y": "0.1"}, ["x"], [0.02], [1, 3],
+                          [0.1, 0.2], 0.5, rows=16),
+    "enzyme": system("s c", ["-10*s*(1 - c) + 2*c", "10*s*(1 - c) - 3*c"], {"s": "0.05", "c": "0.03"}, ["s"], [1e-3], [1, 0.3],
+                     [0.04, 0.01], 0.15, rows=16),
+    "growth": system("c s", ["(s/(0.5 + s) - 0.3)*c", "0.3*(2 - s) - 2*s/(0.5 + s)*c"], {"c": "0.05*c", "s": "0.05"}, ["c"],
+                     [1e-3], [0.5, 1], [0.02, 0.04], 3.0, rows=16),
+    "patches": system("x y", ["x*(1 - x)*(x - 0.2) + 0.1*(y - x)", "y*(1 - y)*(y - 0.2) + 0.1*(x - y)"],
+                      {"x": "0.1*x", "y": "0.1*y"}, ["10*x + 10*y"], [1], [], [], 1.0, rows=16, domain=_POSITIVE,
+                      observation_family="poisson", prior=_log_normal({"x": -0.5, "y": -0.5}, 0.3)),
     # three states
     "battery": system("soc v1 v2", ["-I/8280", "I/1500 - v1/30", "I/20000 - v2/600"], {"soc": "2e-5", "v1": "1e-4", "v2": "3e-5"},
                       [_CELL.format(" - v2")], [2.5e-5], [0.7, 0, 0], [0.02, 1e-4, 1e-4], 60.0, inputs=["I"],
@@ -113,6 +136,12 @@ SYSTEMS: dict[str, System] = {
     "neuron": system("v w c", ["3*(v - v**3/3 - w + c)", "(v + 0.7 - 0.8*w)/12", "0"], {"v": "0.2", "w": "0.03", "c": "0.02"},
                      ["exp(0.5 + v)"], [1], [-1, -0.5, 0.4], [0.2, 0.05, 0.05], 0.6, observation_family="poisson"),
     "track": system("x v a", ["v", "a", "-a"], {"a": "0.5"}, ["sqrt(1 + x**2)"], [1e-3], [3, -0.5, 0], [0.2, 0.1, 0.1], 0.3),
+    "bursting": system("x y z", ["y - x**3 + 3*x**2 - z + 2", "1 - 5*x**2 - y", "0.01*(4*(x + 1.6) - z)"],
+                       {"x": "0.2", "y": "0.2", "z": "0.02"}, ["x"], [0.05], [-1, -4, 1.8], [0.2, 1, 0.04], 0.5, rows=16),
+    "lorenz-84": system("x y z", ["-y**2 - z**2 - 0.25*x + 2", "x*y - 4*x*z - y + 1", "4*x*y + x*z - z"],
+                        {"x": "0.1", "y": "0.1", "z": "0.1"}, ["x", "y"], [0.05, 0.05], [1, 0, 0], [0.2] * 3, 0.2, rows=16),
+    "glucose": system("g x i", ["-0.03*(g - 90) - x*g", "-0.02*x + 1e-5*(i - 10)", "-0.1*(i - 10) + 0.01*max(g - 100, 0)"],
+                      {"g": "1", "x": "2e-4", "i": "0.5"}, ["g"], [25], [180, 1e-3, 20], [100, 1e-6, 25], 5.0, rows=16),
     # four to six
     "bearings": system("x y u v", ["u", "v", "0", "0"], {"u": "0.05", "v": "0.05"}, ["atan2(y - 3*sin(t/5), x - t + 4*sin(t/4))"],
                        [4e-4], [20, 12, 0, 0], [25, 25, 0.25, 0.25], 0.5),

@@ -12,9 +12,8 @@ import zakai
 
 # A file imports files of its own folder, and of those before it in this list; imports inside functions count.
 FOLDERS = [
-    *("densities", "models", "algebra"),
     *("numerics", "numerics/sums", "numerics/gaussian", "numerics/line", "numerics/series", "numerics/space"),
-    *("numerics/particles", "numerics/trains", "records", "simulation"),
+    *("numerics/particles", "numerics/trains", "densities", "models", "algebra", "records", "simulation"),
     *("methods", "methods/system", "methods/gaussian", "methods/gaussian/extended", "methods/sums", "methods/yau"),
     *("methods/line", "methods/reflecting", "methods/space", "methods/grid", "methods/particles", "methods/frame"),
     *("methods/series", "notes", "engine", "diagnostics", "inference", "peers", "studies", "report", "studio", "cli"),

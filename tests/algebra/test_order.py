@@ -164,3 +164,29 @@ def test_a_faster_method_is_named_where_a_third_of_the_time_is_expected():
     assert faster(zakai.Model(**EPIDEMIC), PARTICLES, 10.0) is None  # a grid needs more
     assert faster(zakai.Model(**RE_ENTRY), PARTICLES, 10.0) == "tensor-train"
     assert faster(zakai.load_model("gallery:cubic-sensor"), "yau-yau", 10.0) is None
+
+
+def test_a_prior_by_a_formula_counts_as_the_gaussian_that_it_is():
+    def of(variance, prior):
+        return zakai.Model(
+            state=["x", "y"], drift=["-0.1*x", "-0.1*y"], diffusion=[["0.3", "0"], ["0", "0.3"]],
+            observation=["sqrt(x**2 + y**2)"], observation_kind="samples", observation_noise=[[variance]], prior=prior,
+        )  # fmt: skip
+
+    formula = {"kind": "density", "log_density": "-(x - 2)**2/4 - y**2/4"}
+    assert chosen(of(1e-8, formula), "auto")[0] == PARTICLES and chosen(of(1e-2, formula), "auto")[0] == "yau-yau"
+
+
+def test_the_information_of_a_law_stands_for_the_noise_of_a_sensor():
+    from zakai.algebra.expected_work import curvature
+
+    def of(**keys):
+        return zakai.Model(
+            state=["x", "y"], drift=["-0.1*x", "-0.1*y"], diffusion=[["0.3", "0"], ["0", "0.3"]], observation_kind="samples",
+            prior={"kind": "gaussian", "mean": [2, 0], "cov": [0.2, 0.2]}, **keys,
+        )  # fmt: skip
+
+    distance = "sqrt(x**2 + y**2 + 1)"
+    counts = of(observation=[f"10000*{distance}"], observation_family="poisson")  # with the variance 10000 sqrt(5) at the mean
+    gaussian = of(observation=[distance], observation_noise=[["sqrt(5)/10000"]])
+    assert curvature(counts) == pytest.approx(curvature(gaussian), rel=1e-3) and curvature(counts) > 1.0

@@ -91,6 +91,8 @@ def test_four_states_on_a_grid_are_advised_to_take_particles():
     assert warnings_of_run(result)[0].endswith("; compare with guided-particles")
     result.state = tuple("abcd")
     assert warnings_of_run(result)[0].endswith("; take guided-particles")
+    result.health["error_estimate"] = np.array([0.0, 0.005, 0.02])  # particles leave an error of 0.03
+    assert "guided-particles" not in warnings_of_run(result)[0]
 
 
 def dense(times, values, h, noise, x):

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from zakai.engine.driver import check_records
+from zakai.engine.first_interval import first_interval
 from zakai.engine.loop import CHUNK, advance
 from zakai.engine.plan import plan_of
 from zakai.engine.setting import Setting
@@ -72,7 +73,8 @@ def expected_seconds(model: Model, record: Record, method: str = "auto", *, most
     """
     check_records(model, record)
     found = []
-    runs = plan_of(model, model.prior, method, options).runs(record, "moments")
+    unfit = first_interval(model, record).fault
+    runs = plan_of(model, model.prior, method, options, unfit=unfit).runs(record, "moments")
     for run in runs:
         found.append(_of_block(run.setting, run.schedule, run.values, most / len(runs)))
     return Expected(sum(one.seconds for one in found), any(one.at_least for one in found))

@@ -10,6 +10,7 @@ from contextlib import nullcontext
 from threading import Event, Lock, Thread
 from typing import Any
 
+from zakai import _registry
 from zakai._progress import FIRST, Progress, bar, within_announced
 from zakai.algebra.choice import faster
 from zakai.engine.loop import Run
@@ -69,8 +70,10 @@ def _advice(run: Run, each: float, left: float) -> str:
     """Return what shortens a run of which an observation takes `each` seconds and the rest `left`."""
     method, model = run.setting.method, run.setting.model
     other = faster(model, method.name, each) if left > MINUTE else None
-    also = "" if other is None or other in method.shorter else f", or take {other}, which holds too and is expected to be faster"
-    return f"to shorten it, {method.shorter}{also}"
+    if other is None or other in method.shorter:
+        return f"to shorten it, {method.shorter}"
+    errors = ", with random errors" if _registry.load(other).random and not method.random else ""
+    return f"to shorten it, {method.shorter}, or take {other}, which holds too and is expected to be faster{errors}"
 
 
 class _Watch:

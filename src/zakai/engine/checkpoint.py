@@ -155,7 +155,7 @@ def _decoded(template: Any, data: Any, arrays: Iterator[tuple[int, np.ndarray]])
         _check(template is None or isinstance(template, np.ndarray))
         return None
     _check(type(data) is type(template))
-    _check(type(data) is not float or abs(data) <= LARGEST)
+    _check(type(data) is not float or abs(data) <= LARGEST or data == template)  # the first may be infinite
     return data
 
 

@@ -24,10 +24,10 @@ if TYPE_CHECKING:
 class Estimate:
     """The posterior at a time: its moments, the health of the step, and the whole density."""
 
-    __slots__ = ("_online", "_moments", "_density")
+    __slots__ = ("_online", "_feeds", "_moments", "_density")
 
     def __init__(self, online: Online, moments: tuple[Moment, ...]):
-        self._online, self._moments = online, moments
+        self._online, self._feeds, self._moments = online, online.feeds, moments
         self._density: Density | None = None
 
     def __repr__(self) -> str:
@@ -95,7 +95,7 @@ class Estimate:
     def warnings(self) -> tuple[str, ...]:
         """A sentence for every bound that this step exceeded, and for what else is to be known of it."""
         said: dict[str, None] = {}
-        for feed, moment in zip(self._online.feeds, self._moments, strict=True):
+        for feed, moment in zip(self._feeds, self._moments, strict=True):
             said.update(dict.fromkeys(feed.notes(moment)))
             if moment.info is not None:
                 method = feed.setting.method
@@ -120,7 +120,7 @@ class Estimate:
             raise InputError(f"interval: the probability {probability!r} must be between 0 and 1")
         tail = 0.5 * (1 - probability)
         online, found = self._online, np.empty((self._online.model.n, 2))
-        for i, (feed, moment) in enumerate(zip(online.feeds, self._moments, strict=True)):
+        for i, (feed, moment) in enumerate(zip(self._feeds, self._moments, strict=True)):
             info = moment.info
             if info is not None and _is_gaussian(feed):
                 half = _deviations(1 - tail) * np.sqrt(np.maximum(info.cov.diagonal(), 0.0))
@@ -131,7 +131,7 @@ class Estimate:
         return found
 
     def _part(self, index: int) -> Density:
-        return self._online.feeds[index].density(self._moments[index])
+        return self._feeds[index].density(self._moments[index])
 
 
 @lru_cache(maxsize=8)

@@ -9,10 +9,14 @@ from typing import Any
 
 import numpy as np
 
+from zakai.algebra.independent import IndependentBlock
 from zakai.engine.checkpoint import restored, stored
 from zakai.engine.driver import check_model, planned
 from zakai.engine.estimate import Estimate
-from zakai.engine.feed import Feed
+from zakai.engine.feed import Feed, Moment
+from zakai.engine.first_interval import FirstInterval, asked
+from zakai.engine.plan import Plan
+from zakai.engine.setting import Setting
 from zakai.engine.versions import other_versions, versions
 from zakai.errors import InputError
 from zakai.models._errors import named
@@ -42,7 +46,8 @@ def online(
 
     Args:
         model: the system, with a prior.
-        method: a method's name, or "auto", as for `zakai.filter`.
+        method: a method's name, or "auto", as for `zakai.filter`. Of several states "auto" may take another method when the first
+            interval is known; an estimate at the model's start itself is then by the method before.
         inputs: the known inputs of the model that are known before; `update` takes later ones.
         unit: the model's unit of time, where times are dates, as for `zakai.Record`.
         origin: the date at which t = 0, with `unit`.
@@ -76,12 +81,14 @@ class Online:
         check_possible(model, model.start)
         if options.get("form") == "one-shot":
             raise InputError('option form: "one-shot" needs all times from the start on; an online filter takes "stepwise"')
-        plan = planned(model, None, method, options)
+        self.plan = planned(model, None, method, options)
         self.model, self.options, self.clock = model, options, clock
-        self.blocks, self.method, self.why = plan.blocks, plan.method, plan.why
         check_noise_at(model, [model.start])
-        self.feeds = tuple(Feed(setting) for setting in plan.settings)
+        self.feeds = tuple(Feed(setting) for setting in self.plan.settings)
         self.lock = RLock()
+        # "auto" asks for the first interval, which is not known yet; until then what is observed at the start is kept.
+        self.undecided = method == "auto" and any(asked(feed.setting) for feed in self.feeds)
+        self.at_start: list[list[float]] = []
         if inputs is not None:
             given = expected_inputs(inputs, "online: inputs").on(clock)
             given.check(model, max(self.time, float(given.times[0])), self.time, name="online: inputs")
@@ -94,6 +101,21 @@ class Online:
 
     def _repr_html_(self) -> str:
         return self.last._repr_html_()
+
+    @property
+    def blocks(self) -> tuple[IndependentBlock, ...]:
+        """The independent blocks of the system."""
+        return self.plan.blocks
+
+    @property
+    def method(self) -> str:
+        """The name of the method, or of those of the blocks; "auto" may take another one when the first interval is known."""
+        return self.plan.method
+
+    @property
+    def why(self) -> str:
+        """On what grounds the method was chosen."""
+        return self.plan.why
 
     @property
     def time(self) -> float:
@@ -119,15 +141,47 @@ class Online:
         with self.lock:
             time = self._time(time)
             known = self._known("update", time, inputs) if self.model.inputs or inputs is not None else None
-            parts = zip(self.feeds, self._divided(values), strict=True)
-            try:
-                moments = tuple([feed.moved(time, part, known) for feed, part in parts])
-            except (MemoryError, OverflowError):
-                fault = f"the time from {self.time:.12g} to {time:.12g} is too long for this filter; check its unit"
-                raise InputError(f"update: {fault}") from None
-            for feed, moment in zip(self.feeds, moments, strict=True):
-                feed.now = moment
+            if self.undecided and time > self.time:
+                self._take(planned(self.model, None, "auto", self.options, unfit=FirstInterval(time, known).fault))
+                self.undecided = False
+            moments = self._moved(time, values, known)
+            if self.undecided:
+                self.at_start.append(values)
         return Estimate(self, moments)
+
+    def _moved(self, time: float, values: list[float], known: Inputs | None) -> tuple[Moment, ...]:
+        """Advance all blocks to an observation."""
+        parts = zip(self.feeds, self._divided(values), strict=True)
+        try:
+            moments = tuple([feed.moved(time, part, known) for feed, part in parts])
+        except (MemoryError, OverflowError):
+            fault = f"the time from {self.time:.12g} to {time:.12g} is too long for this filter; check its unit"
+            raise InputError(f"update: {fault}") from None
+        for feed, moment in zip(self.feeds, moments, strict=True):
+            feed.now = moment
+        return moments
+
+    def _with_methods(self, names: Any) -> Plan:
+        """Return the plan of "auto" that takes these methods for the blocks; any other where they do not hold."""
+        listed = names if isinstance(names, list) and len(names) == len(self.blocks) else [""] * len(self.blocks)
+        wanted = {id(block.model): name for block, name in zip(self.blocks, listed, strict=True)}
+
+        def fault(setting: Setting) -> str:
+            return "" if setting.method.name == wanted.get(id(setting.model)) else "not over the first interval"
+
+        return planned(self.model, None, "auto", self.options, unfit=fault)
+
+    def _take(self, plan: Plan) -> None:
+        """Take another plan at the model's start, where it has other methods."""
+        if plan.method == self.method:
+            return
+        known = next((feed.now.inputs for feed in self.feeds if feed.setting.model.inputs), None)
+        self.plan, self.feeds = plan, tuple(Feed(setting) for setting in plan.settings)
+        for feed in self.feeds:
+            if feed.setting.model.inputs:
+                feed.now = feed.now._replace(inputs=known)
+        for values in self.at_start:
+            self._moved(self.time, values, known)
 
     def predict(self, time: float, inputs: Any = None) -> Estimate:
         """Return the estimate at a later time, or now, if nothing is observed until then; the filter stays as it was.
@@ -159,7 +213,10 @@ class Online:
         with self.lock:
             parts = [stored(feed.now._replace(notes=feed.notes(feed.now))) for feed in self.feeds]
         arrays = {f"{i}/{k}": array for i, (_, own) in enumerate(parts) for k, array in enumerate(own)}
-        write_checkpoint(path, {**self._bound, "filters": [said for said, _ in parts], "more": dict(more or {})}, arrays)
+        about = {**self._bound, "filters": [said for said, _ in parts], "more": dict(more or {})}
+        about["methods"] = [feed.setting.method.name for feed in self.feeds]
+        about["at_start"] = [[None if one != one else one for one in values] for values in self.at_start]
+        write_checkpoint(path, about, arrays)
 
     def restore(self, path: str | os.PathLike[str]) -> dict[str, Any]:
         """Go on from a checkpoint of a filter of the same model, method, options and versions, with the same numbers to the bit.
@@ -172,22 +229,29 @@ class Online:
         about, arrays = read_checkpoint(path)
         if wrong := other_versions(about.get("versions")):
             raise InputError(f"{shown(path)}: was written with another version of {wrong}; name another file, or remove it")
-        for what, own in self._bound.items():
+        plan, feeds, at_start = self.plan, self.feeds, list[list[float]]()
+        if self.undecided and about.get("method") != plan.method:
+            plan = self._with_methods(about.get("methods"))
+            feeds = tuple(Feed(setting) for setting in plan.settings)
+        for what, own in {**self._bound, "method": plan.method}.items():
             if about.get(what) != own:
                 said = "" if what == "model" else f" ({_short(about.get(what))}, not {_short(own)})"
                 raise InputError(f"{shown(path)}: is the checkpoint of another {what}{said}; name another file, or remove it")
         try:
             filters, more = about["filters"], about["more"]
-            own_arrays = [[arrays[f"{i}/{k}"] for k in range(_count(arrays, i))] for i in range(len(self.feeds))]
+            own_arrays = [[arrays[f"{i}/{k}"] for k in range(_count(arrays, i))] for i in range(len(feeds))]
             if not isinstance(more, dict) or sum(map(len, own_arrays)) != len(arrays):
                 raise ValueError
             with self.lock:
-                every = zip(self.feeds, filters, own_arrays, strict=True)
+                at_start = [self._values(values) for values in about["at_start"]]
+                every = zip(feeds, filters, own_arrays, strict=True)
                 moments = [restored(feed, said, own) for feed, said, own in every]
                 if len({moment.time for moment in moments}) != 1:
                     raise ValueError
-                for feed, moment in zip(self.feeds, moments, strict=True):
+                for feed, moment in zip(feeds, moments, strict=True):
                     feed.now = moment
+                self.plan, self.feeds, self.at_start = plan, feeds, at_start
+                self.undecided = self.undecided and not self.time > float(self.model.start)
         except (KeyError, TypeError, ValueError):
             raise InputError(f"{shown(path)}: the checkpoint does not fit this filter; remove it to start again") from None
         return more

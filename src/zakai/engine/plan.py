@@ -104,7 +104,7 @@ def plan_of(
     if division is None:
         return _plan_of_whole(model, prior, method, options, unfit)._replace(request=(method, options))
     if unfit is not None and method == "auto":
-        plans = {block.model: _plan_of_whole(block.model, block.prior, method, {}, unfit) for block in division.blocks}
+        plans = {block.model: _plan_of_whole(block.model, block.prior, method, options, unfit, True) for block in division.blocks}
         own_methods = {part: plan.method for part, plan in plans.items()}
         division = replace(division, methods=own_methods, conditions={part: plan.considered for part, plan in plans.items()})
     names = dict.fromkeys(division.methods.values())
@@ -125,18 +125,22 @@ _LAST = "guided-particles"  # which keeps a prior no better than a grid does
 
 
 def _plan_of_whole(
-    model: Model, prior: Prior | None, method: str, options: Mapping[str, Any], unfit: Callable[[Setting], str] | None = None
+    model: Model, prior: Prior | None, method: str, options: Mapping[str, Any], unfit: Callable[[Setting], str] | None = None,
+    shared: bool = False,
 ) -> Plan:
-    """Return the plan of one method for the whole system.
+    """Return the plan of one method for the whole system, or for a block, for which of `shared` options the tolerance counts.
 
     "auto" goes on to the next one that holds where a method is unfit, or loses the density at the prior.
     """
     tolerance = tolerance_asked(options)
     name, why, considered = chosen(model, method, tolerance)
     lost: list[str] = []
+    own = options
     while True:
         loaded = _registry.load(name)
-        setting = Setting.of(model, prior, loaded, _own_options([loaded], options)[0])
+        if shared:
+            own = {"tolerance": tolerance} if "tolerance" in loaded.options and tolerance is not None else {}
+        setting = Setting.of(model, prior, loaded, _own_options([loaded], own)[0])
         exact = name == "kalman-bucy" and isinstance(prior, GaussianPrior)
         order = in_order(model, tolerance)
         later = order[order.index(name) + 1 :] if method == "auto" and not exact else ()

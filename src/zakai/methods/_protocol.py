@@ -234,6 +234,9 @@ class Method(Generic[P, S]):
 
     Optional: `backward` is the backward pass of `zakai.smooth`.
 
+    Optional: `bounded(prepared, points)` returns what is prepared with a bound on the work in an interval, in grid points; the
+    health figures of a step that would need more are those of a lost density.  "auto" tries the first interval with it.
+
     Optional: `reduced(state)` returns a state of which only the density and the backward pass are asked, without what the next
     step needs: those are the states that a result keeps.
     """
@@ -263,6 +266,7 @@ class Method(Generic[P, S]):
     for_interval: Callable[[P, Schedule], P] | None = None
     backward: Backward[P, S, Any] | None = None
     reduced: Callable[[S], S] | None = None
+    bounded: Callable[[P, float], P] | None = None
 
     @property
     def all_options(self) -> dict[str, Any]:

@@ -53,6 +53,7 @@ NOTICEABLE = 1e-3  # deviations: an error of the mean within three digits of the
 VISIBLE = 0.1  # deviations: an error that draws can confirm
 UNKNOWN = 1.0  # deviations: an estimated error as large as the density is wide says that it may be lost
 MANY = 4  # states on a grid, which is too coarse for most densities then
+OF_PARTICLES = 0.03  # deviations: the error of means by particles, unless another one is asked for; it is no advice below that
 _OF_LOST = {"splitting_error": "the steps in time do not resolve the motion of the density"}
 # What to change, for the figures whose words do not say it.
 ADVICE = {
@@ -204,7 +205,7 @@ def _of_tolerance(result: Result, over: Array, distances: Callable[[], Array | N
         start, stop = (f"t = {result.times[k]:.12g}" for k in (off[0], last))
         when = f"from {start} on" if last + 1 == end else f"at {start}" if last == off[0] else f"from {start} to {stop}"
         size = f"{largest:.1g} deviations, {when}"
-        change = advice if largest > VISIBLE or len(result.state) >= MANY else _MORE_OBSERVATIONS
+        change = advice if largest > (OF_PARTICLES if len(result.state) >= MANY else VISIBLE) else _MORE_OBSERVATIONS
         said.append(f"the means may be off by about {size} {figure}; {change}")
     if len(unknown):
         when = f"{result.times[end]:.12g}"

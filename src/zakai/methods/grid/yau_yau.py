@@ -75,7 +75,7 @@ def variant(model: Model, options: Mapping[str, Any]) -> Method[Any, Any]:
         return on_line(METHOD, model)
     from zakai.methods.space import kolmogorov as space_kolmogorov
 
-    found = in_space(METHOD, space_kolmogorov.prepare)
+    found = replace(in_space(METHOD, space_kolmogorov.prepare), bounded=space_kolmogorov.Prepared.bounded)
     # A grid of four states is limited by its memory: another tolerance changes neither its time nor its error for the better.
     return replace(found, shorter="take guided-particles") if model.n >= MANY else found
 

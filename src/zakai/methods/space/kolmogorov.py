@@ -27,10 +27,10 @@ from zakai.models.features import CROSS_NOISE
 from zakai.models.model import Model
 from zakai.numerics.complex_step import is_complex
 from zakai.numerics.prior_grid import mixture_grid
-from zakai.numerics.space.advance import CHECKED, Control, advance
+from zakai.numerics.space.advance import CHECKED, VANISHED, Control, advance
 from zakai.numerics.space.field import NOTHING, Field, Report, positive, spline_error
 from zakai.numerics.space.grid import Grid
-from zakai.numerics.space.step import Stepper
+from zakai.numerics.space.step import ExhaustedError, Stepper
 from zakai.numerics.space.survey import Survey
 from zakai.numerics.space.update import Update, updated
 from zakai.numerics.space.window import MOST, Bounds
@@ -47,6 +47,7 @@ FINER = 2.0  # ratio of the spacings of a grid to those of its splines, where th
 SHARE = 0.2  # of the tolerance, for the error in time of one interval
 LOST = 0.5  # error of a density relative to itself
 KEPT = 0.98  # largest share of an error that an interval is taken to leave
+OF_FIELDS = 10.0  # work of a point where the noise depends on the state, in that of others (measured: 8 to 20)
 WIDER = 1.1  # growth of the deviations after which the error of a substep is measured again
 
 
@@ -61,7 +62,8 @@ class Increments(NamedTuple):
 class Prepared:
     """A model, a schedule and parameters, with the bounds that follow from the tolerance.
 
-    `lie` tells whether the filter splits an interval at its end only, which has no backward pass.
+    `lie` tells whether the filter splits an interval at its end only, which has no backward pass.  An interval in which a density
+    would be computed at more than `most_work` grid points loses it.
     """
 
     model: Model
@@ -74,6 +76,7 @@ class Prepared:
     notes: tuple[str, ...] = ()
     motions: dict[Any, Any] = field(default_factory=dict)
     lie: bool = False
+    most_work: float = math.inf
 
     def init(self, prior: Any) -> State:
         """Return the prior on a grid."""
@@ -88,6 +91,10 @@ class Prepared:
         """Return the state of a prior."""
         mass, control = field.values.sum() * field.grid.cell, Control(np.inf, 0.0, 0)
         return self._state(field, mass, control, np.zeros(self.model.n), error, 0.9)
+
+    def bounded(self, points: float) -> Prepared:
+        """Return the same with a bound on the work in an interval."""
+        return replace(self, most_work=points)
 
     @property
     def correlated(self) -> bool:
@@ -209,10 +216,14 @@ class Prepared:
                 mean, cov = moments_of(result.values.real, result.grid, bounds.periodic)
                 points = mean + np.concatenate([np.zeros((1, len(mean))), np.diag(np.sqrt(np.diagonal(cov)))])
                 least = max(fewest, observations.least(points, start, length, inside))
-            stepper = Stepper(observations.dynamics, bounds, self.tolerance)
+            most_work = self.most_work / (OF_FIELDS if observations.system.state_dependent else 1.0)
+            stepper = Stepper(observations.dynamics, bounds, self.tolerance, most_work)
             if steppers is not None:
                 steppers.append(stepper)
-            result, more, control = advance(stepper, result, start, length, potential, control, allowed / len(parts), least)
+            try:
+                result, more, control = advance(stepper, result, start, length, potential, control, allowed / len(parts), least)
+            except ExhaustedError:
+                return result, report.worst(VANISHED), Control(np.inf, 0.0, 0)
             if least >= MOST_PANELS:
                 more = more._replace(splitting=max(more.splitting, 1.0))
             if observations.system.state_dependent:  # mass where the noise has no value may be anywhere on the grid
