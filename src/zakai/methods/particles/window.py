@@ -17,6 +17,7 @@ from zakai.methods.particles.programs import Array
 from zakai.methods.particles.system import root
 from zakai.numerics.particles import moves
 from zakai.numerics.particles.chunks import CHUNK, over_chunks
+from zakai.numerics.particles.even import Even
 
 INTERVALS = 64  # of a window
 # Normal numbers of a particle in a window, at least and at most: a move costs their square.  Between these it is as many as all
@@ -233,12 +234,12 @@ class Target:
         prior = self.prior or (np.zeros(n), np.zeros((n, 0)))
         return moves.WindowLaw(self.motion.arrays, tuple(self.events), observed, prior)
 
-    def propagate(self, key: Array, update: bool) -> tuple[moves.Advance, int]:
+    def propagate(self, even: Even, update: bool) -> tuple[moves.Advance, int]:
         """Return the particles after noise that is drawn, and how many are lost; with `update` those before the last one, too."""
         n, count = self.start.shape
         noise, states, seen = (np.empty((rows, count)) for rows in (self.events.width, n, n if update else 0))
         after, arrays = moves.Advance(noise, states, seen, np.empty(count)), self.arrays
-        lost = over_chunks(lambda low, high: moves.propagate(arrays, key, self.start, low, high, after), count)
+        lost = over_chunks(lambda low, high: moves.propagate(arrays, even, self.start, low, high, after), count)
         return after, sum(lost)
 
     def follow(self, path: Array) -> tuple[Array, Array]:
@@ -248,11 +249,11 @@ class Target:
         over_chunks(lambda low, high: moves.follow(arrays, self.start, path, low, high, out, total), len(total))
         return out, total
 
-    def draw(self, gaussian: Any, share: float, key: Array) -> tuple[Array, Array]:
+    def draw(self, gaussian: Any, share: float, even: Even) -> tuple[Array, Array]:
         """Return noise (D, N) of which a share is drawn from N(0, I), and log N(0, I) less the log of its density (N,)."""
         count = self.start.shape[1]
         path, ratio = np.empty((len(gaussian[0]), count)), np.empty(count)
-        over_chunks(lambda low, high: moves.draw(gaussian, share, key, self.start, low, high, path, ratio), count)
+        over_chunks(lambda low, high: moves.draw(gaussian, share, even, self.start, low, high, path, ratio), count)
         return path, ratio
 
     def sweep(
