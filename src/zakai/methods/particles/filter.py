@@ -21,6 +21,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from zakai.methods._protocol import Info
+from zakai.methods.particles.block import drawn_again
 from zakai.methods.particles.events import Events, Interval, Observed, with_update
 from zakai.methods.particles.interval import (
     MOST_SUBSTEPS,
@@ -196,10 +197,10 @@ def _step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[Stat
     found = cloud.islands.spread(after.particles)
     doubtful = size < TEMPER_BELOW * len(weights) or done.levels > 3
     acceptance, moved = done.acceptance, 0.0
-    error, own_loss = (_loss(part, cov, len(weights)) for part in (found.variance, found.independent))
-    loss = _loss(np.maximum(found.variance, found.independent), cov, len(weights))
+    own = found.independent
     if done.unseen:  # what is lost now does not come back by the noise of later intervals
-        own_loss = min(own_loss, 1.0)
+        own = np.minimum(own, np.diag(cov) / len(weights))
+    error, own_loss, loss = (_loss(part, cov, len(weights)) for part in (found.variance, own, np.maximum(found.variance, own)))
     present, floor = max(loss - own_loss - control.floor, 0.0), FORGOTTEN * control.floor
     excess, known = control.excess + present, FORGOTTEN * control.known + control.present
     remembered = FORGOTTEN * control.remembered + min(control.present, present)
@@ -352,6 +353,12 @@ def _advanced(
     even = cloud.islands.even(prepared.key(number, GUIDE), rank)
     best = (gaussian and _guided(target, cloud, plain, gaussian, even)) or Drawn(plain, first, logs, None)
     size = effective(best.after.weights) if np.isfinite(best.after.gained) else 0.0
+    if size < TEMPER_BELOW * count and not moving:
+        block = drawn_again(cloud.window, np.exp(cloud.logs), target, GUIDE_SHARE, even)
+        found, gained = normalised(cloud.logs + block.logs) if block is not None else (weights, -np.inf)
+        if block is not None and np.isfinite(gained) and effective(found) > max(size, TEMPER_BELOW * count):
+            after = cloud._replace(particles=block.particles, logs=cloud.logs + block.logs - gained, window=block.window)
+            return plain._replace(cloud=after, weights=found, gained=gained, noise=block.noise, guided=True)
     if size >= min(TEMPER_BELOW * count, TEMPER_FLOOR) or not np.isfinite(best.logs).any():
         return best.after
     return _tempered(prepared, target, cloud, best, number)

@@ -158,6 +158,47 @@ class Window(NamedTuple):
         window = before.moved(path, start, ends[-1])
         return window._replace(ends=(*ends, *before.ends[length:]))
 
+    def last(self, motion: Motion, count: int) -> tuple[Window, Array, Array]:
+        """Return the past of the particles in the last intervals.
+
+        Returns:
+            The window without ancestors and states in them, the states (n, N) before them, and the noise (D, N) in them.
+        """
+        place, index, noises = self.length - count, None, list[Array]()
+
+        def own(columns: Array) -> Array:
+            return columns if index is None else taken(columns, index)
+
+        def before(k: int) -> Array | None:
+            ancestors = self.ancestors[k]
+            return index if not len(ancestors) else ancestors if index is None else ancestors[index]
+
+        for k in reversed(range(place, self.length)):
+            index = before(k)
+            noises.append(own(self.noises[k]))
+        none, window = (_EMPTY,) * INTERVALS, self
+        if place == 0:
+            start = own(self.mean[:, None] + self.root @ self.first if len(self.first) else self.start)
+            window = self._replace(start=own(self.start), first=own(self.first))
+        else:
+            index, end = before(place - 1), self.ends[place - 1]
+            if not end.size:
+                end = self.part(motion, np.arange(self.noises[place - 1].shape[1]), place).ends[place - 1]
+            start = own(end)
+            window = self._replace(ancestors=_with(self.ancestors, place - 1, _EMPTY if index is None else index))
+        nothing = (np.zeros((0, 0)),) * len(none[place:])
+        window = window._replace(ancestors=(*window.ancestors[:place], *none[place:]), ends=(*self.ends[:place], *nothing))
+        return window, np.ascontiguousarray(start), np.concatenate(noises[::-1])
+
+    def with_noise(self, count: int, path: Array) -> Window:
+        """Return the window with this noise (D, N) in the last intervals."""
+        noises, place = list(self.noises), 0
+        for k in range(self.length - count, self.length):
+            size = len(noises[k])
+            noises[k] = np.ascontiguousarray(path[place : place + size])
+            place += size
+        return self._replace(noises=tuple(noises))
+
     def target(self, motion: Motion, start: Array) -> Target:
         """Return what the noise of this window must follow."""
         prior = (self.mean, self.root) if len(self.first) else None
