@@ -2,9 +2,9 @@
 
     x_i <- F(x_i, noise_i);   w_i <- w_i p(z | x_i);   resample where 1 / sum w^2 is below half of the particles
 
-A step whose plain weights leave few particles draws the noise again from the Gaussian posterior of the linearised interval, and
-where that fails too, carries plain particles to the posterior by powers of the likelihood with moves between them.  What is drawn
-depends on the seed, the number of the interval and the particle alone.
+A step whose plain weights leave few particles draws the noise again from the Gaussian posterior of the linearised interval, then
+of the last intervals, and where that fails too, carries plain particles to the posterior by powers of the likelihood with moves
+between them.  What is drawn depends on the seed, the number of the interval and the particle alone.
 
 References:
     Gordon, Salmond and Smith 1993, Novel approach to nonlinear/non-Gaussian Bayesian state estimation.
@@ -15,6 +15,7 @@ References:
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -56,13 +57,15 @@ INFORMED = 0.25  # log det of the linearised posterior of the noise, below which
 MOST_LEVELS = 60
 # The past is moved where that pays: by error^2 x time, with N variance of a mean, in variances of the state, as error^2.  What
 # ancestors add to that, beyond what the last move left, is taken away from later steps, and as the ancestors that are lost before
-# a move cannot come back, `MOVE_WORTH` times as much as has added up since the last one counts (error^2 x time of eleven systems
-# is about equal with 8, that of most is more with 2), but no more than the present one adds up to until the state has forgotten
-# it: the share that a step leaves is measured.  That is compared with its cost, both as shares of all so far.  A move waits until
-# it can divide the present loss by `MOVE_GAIN`, and longer where the last one had gained less; what that left is forgotten at a
-# rate.  The cost is counted in normal numbers: those of the window, once and for each sweep by the acceptance of the last, and
-# in a step its own and as many as the rest of it takes.  (Measured: 30 to 38 ns in a move, 0.3 us and 40 ns a number in a step.)
+# a move cannot come back, `MOVE_WORTH` times as much as has added up since the last one counts (error^2 x time of the turn is a
+# third more with 4, of bearings, a falling body and a robot the same), but no more than the present one adds up to until the
+# state has forgotten it: the share that a step leaves is measured.  That is compared with its cost, both as shares of all so far.
+# A move waits until it can divide the present loss by `MOVE_GAIN`, and longer where the last one had gained less; what that left
+# is forgotten at a rate.  The cost is counted in normal numbers: those of the window, once and for each sweep by the acceptance
+# of the last, and in a step its own and as many as the rest of it takes.  (Measured: 30 to 38 ns in a move, 0.3 us and 40 ns a
+# number in a step.)
 MOVE_GAIN, MOVE_WORTH, FORGOTTEN, STEP_WORK, LEAST_RATE = 1.5, 8.0, 0.98, 4.0, 0.3
+TRIED, FEW = 16, 128  # a move is tried on one particle in so many, where these are as many at least
 MOVE_CONTROL = (1.0, 1.2, 4.0, 0.4, 1.0)  # power, change, most sweeps, rho, share
 VARIANCE = 5.0  # that of a mean times N, in variances of the state, that the number of particles is chosen for
 MOST_GROWTH = 4
@@ -192,7 +195,7 @@ def _step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[Stat
     cloud = cloud._replace(window=cloud.window.appended(motion, events, observed, done.noise, ends))
     weights, cov = done.weights, after.cov
     size, largest = effective(weights), float(weights.max())
-    T, end = regression(before.particles, cloud.parents, after.particles), after
+    T, end = regression(before.particles, after.particles, cloud.parents), after
     cloud = cloud._replace(islands=cloud.islands.carried(T), parents=None)
     found = cloud.islands.spread(after.particles)
     doubtful = size < TEMPER_BELOW * len(weights) or done.levels > 3
@@ -209,17 +212,25 @@ def _step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[Stat
     cost = cloud.window.width * (1.0 + MOVE_CONTROL[1] / max(rate, LEAST_RATE))
     worth = min(MOVE_WORTH * excess, future)
     if loss > MOVE_GAIN * (own_loss + floor) and worth * work > cost * losses and cloud.window.width:
-        cloud, acceptance, doubtful_move = _moved(prepared, cloud, weights, number)
-        weights = np.exp(cloud.logs)
-        end = moments_of(system, cloud.particles, weights)
-        islands, cov = cloud.islands.carried(regression(after.particles, cloud.parents, end.particles)), end.cov
-        if len(cloud.window.first) and not doubtful_move:
-            islands = islands.renewed()
-        cloud, found = cloud._replace(islands=islands), islands.spread(end.particles)
-        excess, present, work, moved, rate = 0.0, 0.0, work + cost, 1.0, acceptance
-        remains = _loss(np.maximum(found.variance, found.independent), cov, len(weights))
-        floor = (remains - _loss(found.independent, cov, len(weights))) * max(1.0, MOVE_GAIN * remains / loss) ** 2
-        doubtful = doubtful or doubtful_move
+
+        def gains(T: Array) -> bool:  # where T of the deviations is left
+            return MOVE_GAIN * _loss(np.diag(T @ found.cov @ T.T) + own, cov, len(weights)) < loss
+
+        cloud, accepted, change = _moved(prepared, cloud, weights, number, gains)
+        remains, work, excess = loss, work + cost / TRIED, 0.0
+        if change is not None:
+            weights = np.exp(cloud.logs)
+            end = moments_of(system, cloud.particles, weights)
+            islands, cov = cloud.islands.carried(regression(after.particles, end.particles, cloud.parents)), end.cov
+            acceptance, doubtful_move = accepted, accepted < 0.1 or change < 0.5
+            if len(cloud.window.first) and not doubtful_move:
+                islands = islands.renewed()
+            cloud, found = cloud._replace(islands=islands), islands.spread(end.particles)
+            present, work, moved, rate = 0.0, work + cost, 1.0, acceptance
+            own_loss = _loss(found.independent, cov, len(weights))
+            remains = _loss(np.maximum(found.variance, found.independent), cov, len(weights))
+            doubtful = doubtful or doubtful_move
+        floor = (remains - own_loss) * max(1.0, MOVE_GAIN * remains / loss) ** 2
     # What the weights say of a coordinate makes a shift of the prediction smaller by the ratio of the variances.
     contraction = np.where(done.predicted > 0, np.minimum(1.0, end.spread / np.maximum(done.predicted, 1e-300)) ** 2, 1.0)[:n]
     carried, fresh = T @ state.shift, steps.shift[:n]
@@ -453,17 +464,30 @@ def _loss(variance: Array, cov: Array, count: int) -> float:
     return float((variance[wide] / spread[wide]).mean()) * count if wide.any() else 0.0
 
 
-def _moved(prepared: Prepared, cloud: Cloud, weights: Array, number: int) -> tuple[Cloud, float, bool]:
-    """Return equally weighted particles whose past has been moved, the acceptance, and whether they have moved too little."""
-    cloud, _ = cloud.resampled(weights, len(weights), prepared.key(number, RESAMPLING, MOST_LEVELS + 1))
+def _moved(
+    prepared: Prepared, cloud: Cloud, weights: Array, number: int, gains: Callable[[Array], bool]
+) -> tuple[Cloud, float, float | None]:
+    """Return equally weighted particles whose past has been moved, the acceptance, and the change of the noise.
+
+    A few particles are moved first.  The cloud and no change are returned where what they keep of their states, T (n, n), says
+    that a move gains too little: moves do not cross between modes.
+    """
+    before, count = cloud, len(weights)
+    cloud, _ = cloud.resampled(weights, count, prepared.key(number, RESAMPLING, MOST_LEVELS + 1))
     path, start = cloud.window.path()
     target = cloud.window.target(prepared.motion, start)
     gaussian = target.gaussian(path, None)
     if gaussian is None:
-        return cloud, 0.0, True
+        return before, np.nan, None
+    if count >= TRIED * FEW:
+        few = slice(None, None, TRIED)
+        trial, states = replace(target, start=np.ascontiguousarray(start[:, few])), [cloud.particles[:, few]]
+        states.append(trial.sweep(gaussian, np.ascontiguousarray(path[:, few]), MOVE_CONTROL, prepared.key(number, MOVE, 1))[1])
+        equal = np.full(states[0].shape[1], 1.0 / states[0].shape[1])
+        if not gains(regression(*(moments_of(prepared.system, x, equal).particles for x in states))):
+            return before, np.nan, None
     path, particles, _, rate, change = target.sweep(gaussian, path, MOVE_CONTROL, prepared.key(number, MOVE))
-    window = cloud.window.moved(path, start, particles)
-    return cloud._replace(particles=particles, window=window), rate, rate < 0.1 or change < 0.5
+    return cloud._replace(particles=particles, window=cloud.window.moved(path, start, particles)), rate, change
 
 
 def _wanted(rule: Rule, count: int, variance: float) -> int:

@@ -156,7 +156,7 @@ def _dealt(count: int) -> Array:
     return np.arange(R + 1) * count // R
 
 
-def regression(before: Weighted, parents: Array | None, after: Weighted) -> Array:
+def regression(before: Weighted, after: Weighted, parents: Array | None = None) -> Array:
     """Return T (n, n): the regression of particles on their `parents` (N,) before, None where these are the same."""
     x = before.deviations if parents is None else np.take(before.deviations, parents, axis=1)
     T = np.empty(before.cov.shape)
