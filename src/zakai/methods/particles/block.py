@@ -21,7 +21,7 @@ from typing import NamedTuple
 import numpy as np
 
 from zakai.methods.particles.programs import Array
-from zakai.methods.particles.window import FEWEST, Target, Window, joined
+from zakai.methods.particles.window import MOST, Target, Window, joined
 from zakai.numerics.particles.even import Even
 
 # On Lorenz-96 with eight states, two of them unseen, the log-likelihood has the deviation 0.83 without, 0.33 with four intervals
@@ -50,7 +50,7 @@ def drawn_again(window: Window, weights: Array, target: Target, share: float, ev
         even: what makes normal numbers.
     """
     count, width = 0, target.events.width
-    while count < min(window.length, LONGEST) and width + len(window.noises[window.length - 1 - count]) <= FEWEST:
+    while count < min(window.length, LONGEST) and width + len(window.noises[window.length - 1 - count]) <= MOST:
         count += 1
         width += len(window.noises[window.length - count])
     if count == 0:
