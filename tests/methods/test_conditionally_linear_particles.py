@@ -51,9 +51,10 @@ def test_a_linear_system_that_is_split_by_hand_agrees_with_the_kalman_filter(nam
     record = record_of(model, step=0.25 if model.observation_kind == "samples" else 0.1)
     result, exact = zakai.filter(model, record, PARTICLES, split=True), zakai.filter(model, record, "kalman-bucy")
     assert (result.health["linear_states"][1:] == 1).all()
-    errors = (result.mean - exact.mean)[1:]
-    assert np.abs(errors / result.mean_standard_error[1:]).max() < 4.5
-    assert np.sqrt(np.mean(errors**2 / exact.variance[1:])) < 0.03
+    errors, spread = (result.mean - exact.mean)[1:], np.sqrt(exact.variance[1:])
+    # A step may be wrong by 0.005 deviations in an interval, which 128 particles do not resolve.
+    assert np.abs(errors / np.hypot(result.mean_standard_error[1:], 0.005 * spread)).max() < 4.5
+    assert np.sqrt(np.mean((errors / spread) ** 2)) < 0.01
     assert np.allclose(result.cov[1:], exact.cov[1:], atol=0.1 * np.sqrt(exact.variance.max()))
     assert abs(result.log_likelihood - exact.log_likelihood) < 4 * result.log_likelihood_standard_error + 0.02
 

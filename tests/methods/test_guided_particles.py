@@ -84,6 +84,47 @@ def test_moves_of_the_past_keep_a_parameter_without_noise_known():
     assert np.abs((result.mean - exact.mean) / np.sqrt(exact.variance))[1:].max() < 0.2
 
 
+def test_the_noise_of_several_intervals_is_drawn_again_where_that_of_one_does_not_explain_an_observation():
+    """Two unseen states jump by four deviations, which their sharply seen integrals say in several observations."""
+    model = zakai.Model(
+        state=["x", "y", "a", "b"],
+        drift=["a - x", "b - y", "-0.3*a + 0.5*b", "-0.3*b - 0.5*a"],
+        diffusion=np.diag([0.05, 0.05, 0.1, 0.1]).tolist(),
+        observation=["x", "y"],
+        observation_kind="samples",
+        observation_noise=[[1e-4, 0.0], [0.0, 1e-4]],
+        prior={"kind": "gaussian", "mean": [0.0] * 4, "cov": [0.01] * 4},
+    )
+    _, record = zakai.simulate(model, 0.2 * np.arange(1, 31), seed=1)
+    since = 0.2 * np.arange(1, 19)
+    values = record.values.copy()
+    values[12:] += (0.4 * np.exp(-0.3 * since) * (1.0 - np.exp(-since)))[:, None]
+    record = zakai.Record(record.times, values, "samples")
+    exact = zakai.filter(model, record, "kalman-bucy")
+    runs = [zakai.filter(model, record, PARTICLES, particles=2000, split=False, seed=seed) for seed in range(8)]
+    assert all(np.nansum(run.health["tempering_levels"]) == 0 for run in runs)
+    evidence = np.array([run.log_likelihood - exact.log_likelihood for run in runs])
+    assert np.sqrt(np.mean(evidence**2)) < 0.25  # 0.1; it is 0.8 by powers of the likelihood
+    assert abs(evidence.mean()) < 0.12  # without bias
+    assert np.sqrt(np.mean([deviations(run, exact) ** 2 for run in runs])) < 1.5
+
+
+def test_the_past_is_not_moved_where_moves_would_not_lower_the_error():
+    """Angles of two pendulums in several modes, which moves do not cross: without a trial there are two to three moves."""
+    model = zakai.Model(
+        state=["a", "b", "u", "v"],
+        drift=["u", "v", "-2*sin(a) - 0.5*sin(a - b) - 0.1*u", "-2*sin(b) + 0.5*sin(a - b) - 0.1*v"],
+        diffusion=[["0", "0"], ["0", "0"], ["0.5", "0"], ["0", "0.5"]],
+        observation=["sin(a)", "cos(b)"],
+        observation_noise=[[0.02, 0.0], [0.0, 0.02]],
+        prior={"kind": "gaussian", "mean": [0.5, -0.5, 0.0, 0.0], "cov": [1.0] * 4},
+    )
+    _, record = zakai.simulate(model, 0.1 * np.arange(1, 41), seed=0, substeps=50)
+    runs = [zakai.filter(model, record, PARTICLES, seed=seed) for seed in range(3)]
+    assert max(run.health["monte_carlo_error"][-1] for run in runs) > 0.04  # what ancestors add is large
+    assert sum(np.nansum(run.health["moved"]) for run in runs) == 0
+
+
 def test_the_error_of_a_nearly_constant_state_is_reported_in_a_long_record():
     model = zakai.Model(
         state=["x", "b"],
@@ -100,8 +141,8 @@ def test_the_error_of_a_nearly_constant_state_is_reported_in_a_long_record():
     late = slice(110, None)
     errors = np.array([(run.mean - exact.mean)[late, 1] for run in runs]) / np.sqrt(exact.variance[late, 1])
     reported = np.array([run.mean_standard_error[late, 1] for run in runs]) / np.sqrt(exact.variance[late, 1])
-    assert np.sqrt(np.mean(errors**2)) > 0.2  # few of the first particles are left
-    # Of sixteen seeds and three records the ratio is 0.75 to 0.9; without what is older than 16 resamplings it is below a half.
+    assert np.sqrt(np.mean(errors**2)) > 0.1  # few of the first particles are left
+    # Of twelve seeds and three records the ratio is 0.7 to 1.2.
     assert 0.5 < np.sqrt(np.mean(reported**2) / np.mean(errors**2)) < 2.0
     assert all((run.health["lower_bound"][late] == 1).all() for run in runs)
     assert all(any("uncertain_error" in words for words in run.warnings) for run in runs)

@@ -5,9 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy.linalg import expm
+from scipy.special import ndtr
+from scipy.stats import qmc
 
+from zakai.numerics.particles.even import Even, curve_places, directions, even_normals
 from zakai.numerics.particles.noise import noise_about_middle, write_roots
-from zakai.numerics.particles.population import DEPTH, carry, lineage, moments
+from zakai.numerics.particles.population import carry, mean_directions, moments, sums_of_islands
+from zakai.numerics.particles.random import key_of
 
 RNG = np.random.default_rng(0)
 
@@ -40,29 +44,71 @@ def test_moments_are_those_of_weighted_particles_and_angles_wrap():
     assert np.allclose(cov, expected * weights @ expected.T)
 
 
-def test_families_of_each_generation_and_of_the_first_ancestors():
-    parents = [np.sort(RNG.integers(0, 90, 90)).astype(np.int32) for _ in range(3)]
-    weights, apart = RNG.random(90), RNG.normal(size=(2, 90))
-    weights /= weights.sum()
-    padded = (np.zeros(0, np.int32),) * (DEPTH - 3) + tuple(parents)
-    founders = parents[0][parents[1][parents[2]]] // 2
-    founders = founders.astype(np.int32)
-    means, between, counts = np.empty((5, 2)), np.empty(2), np.empty((2, 5))
-    lineage(padded, np.array([90, 90, 90, 90, 45]), 99, founders, weights, apart, (means, between, counts))
-    labels = [np.arange(90), parents[2], parents[1][parents[2]], parents[0][parents[1][parents[2]]], founders]
-    for k, label in enumerate(labels):
-        size = 45 if k == 4 else 90
-        sums, mass = np.array([np.bincount(label, weights * row, size) for row in apart]), np.bincount(label, weights, size)
-        assert np.allclose(means[k], size / (size - 1) * (sums**2).sum(axis=1))
-        assert np.allclose(counts[:, k], [mass @ mass, np.count_nonzero(mass)])
-        if k == 3:
-            alive = mass > 0
-            assert np.allclose(between, (sums[:, alive] ** 2 / mass[alive]).sum(axis=1))
+def test_mean_directions_are_those_of_weighted_angles():
+    x, weights = RNG.normal(2.5, 1.0, size=(2, 700)), RNG.random(700)
+    mean = np.zeros(2)
+    mean_directions(x, weights, np.array([False, True]), mean)
+    assert np.allclose(mean, [0.0, np.angle(np.exp(1j * x[1]) @ weights)])
 
 
-def test_excess_is_carried_by_the_regression_on_the_states_before():
+def test_sums_of_islands():
+    bounds, weights, apart = np.array([0, 30, 30, 75, 90]), RNG.random(90), RNG.normal(size=(2, 90))
+    sums, masses, independent = np.empty((4, 2)), np.empty(4), np.empty(2)
+    sums_of_islands(bounds, weights, apart, sums, masses, independent)
+    parts = [slice(*pair) for pair in zip(bounds[:-1], bounds[1:])]
+    assert np.allclose(sums, [apart[:, part] @ weights[part] for part in parts])
+    assert np.allclose(masses, [weights[part].sum() for part in parts])
+    assert np.allclose(independent, 90 / 89 * (weights * apart) ** 2 @ np.ones(90))
+
+
+def test_a_regression_on_the_states_before():
     cov = np.diag([1.0, 4.0, 0.0])
-    across, X, T = RNG.normal(size=(3, 3)), np.array([np.eye(3)]), np.empty((3, 3))
-    carry(X, across, cov, T)
+    across, T = RNG.normal(size=(3, 3)), np.empty((3, 3))
+    carry(across, cov, T)
     assert np.allclose(T, across @ np.diag([1.0, 0.25, 0.0]))
-    assert np.allclose(X[0], T @ T.T)
+
+
+def test_direction_numbers_are_those_of_sobol():
+    points = qmc.Sobol(len(directions()), scramble=False, bits=32)
+    for k in range(12):
+        points.reset()
+        points.fast_forward(2**k)  # the point of Gray's code of 2^k, which has the bits k and k - 1
+        expected = (points.random(1)[0] * 2.0**32).astype(np.uint32)
+        assert (expected == directions()[:, k] ^ (directions()[:, k - 1] if k else 0)).all()
+
+
+def test_numbers_of_an_island_fill_each_coordinate_evenly_and_islands_are_independent():
+    bounds, rank = np.array([0, 256, 256, 768]), np.append(np.arange(256), RNG.permutation(512)).astype(np.int32)
+    out = np.empty((20, 768))
+    even_normals(Even(key_of(3), rank, bounds, directions()), 0, 768, out)
+    for low, high in ((0, 256), (256, 768)):
+        size = high - low
+        p = ndtr(out[:16, low:high])
+        assert (np.sort(np.floor(p * size)) == np.arange(size)).all()  # one in each cell
+        cells = np.floor(p[:2] * 16)  # and as many in each of 16 x 16
+        assert (np.bincount((16 * cells[0] + cells[1]).astype(int), minlength=256) == size / 256).all()
+    assert abs(np.corrcoef(out[:, :256].ravel(), out[:, 256:512].ravel())[0, 1]) < 0.05
+    assert abs(np.mean(out[16:])) < 0.06 and abs(np.std(out[16:]) - 1.0) < 0.05  # beyond the table they are independent
+    other = np.empty((20, 768))
+    even_normals(Even(key_of(3), rank, bounds, directions()), 0, 300, other)
+    even_normals(Even(key_of(3), rank, bounds, directions()), 300, 768, other)
+    assert (other == out).all()
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 6])
+def test_neighbours_on_the_curve_are_near(n):
+    """Of 4,096 points the distance of neighbours is that of a grid, times a constant."""
+    x = RNG.normal(size=(n, 4096))
+    places = np.empty(4096, np.uint16)
+    mixed = np.tril(np.ones((n, n))) @ x  # correlated coordinates are whitened
+    curve_places(mixed, np.atleast_2d(np.cov(mixed)), places)
+    along = x[:, np.argsort(places, kind="stable")]
+    apart = np.linalg.norm(np.diff(along), axis=0).mean()
+    assert apart < 8.0 * np.sqrt(n) * 4096 ** (-1 / n)
+    assert places.max() < 2**16 and len(np.unique(places)) > 500
+
+
+def test_particles_that_do_not_differ_have_one_place():
+    places = np.empty(8, np.uint16)
+    curve_places(np.zeros((2, 8)), np.zeros((2, 2)), places)
+    assert (places == 0).all()

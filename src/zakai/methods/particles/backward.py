@@ -66,7 +66,7 @@ def begin(prepared: Prepared, state: State, count: int, seed: int) -> Message:
     """Return so many draws from the filter's particles at the last time, whose past has been moved."""
     interval, window, motion = state.control.interval, state.window, prepared.motion
     draws, places = _chosen(prepared, state, count, (0, seed))
-    labels = families(state.genealogy, places, interval)
+    labels = families(state.islands, places, interval)
     if window.length:
         window, places = window.part(motion, _last(window.ancestors[window.length - 1], places), window.length), np.arange(count)
         for turn in range(MOVES if window.width else 0):
@@ -110,7 +110,7 @@ def step(prepared: Prepared, k: int, later: Message, values: Array, state: State
     fresh = places >= 0
     draws[:, fresh] = state.particles[:, places[fresh]]
     chosen = np.where(fresh, places, 0)
-    other = Descent.begin(interval, state.window, chosen, families(state.genealogy, chosen, interval))
+    other = Descent.begin(interval, state.window, chosen, families(state.islands, chosen, interval))
     return Message(draws, past.joined_by(fresh, other), float(np.mean(~known)), False, later.seed)
 
 

@@ -42,6 +42,7 @@ GIVEN_AWAY = 4.0
 LATER = 4.0
 OF_LEVEL = 4.0  # times that a power of the likelihood, with its moves, follows the particles through an interval
 TRIED, SUBSTEPS = 1024, 8  # particles by which that is measured, and substeps of the first interval
+MEASURED = 4  # sets of few particles by which the substeps are measured: one set leaves their number open to a fifth
 _DRAWS, _TRIAL = 101, 102  # uses of random numbers, beside those of the filter and of smoothing
 
 
@@ -63,9 +64,9 @@ def _saves_time(prepared: Prepared, k: int, state: State, values: Array) -> bool
     """Return whether the filters have a smaller error^2 x work than draws, by few particles."""
     rule, number, interval = prepared.rule, len(state.log_weights), prepared.interval(k)
     count = min(TRIED, number)
-    cloud = Cloud(state.particles, state.log_weights, state.window, state.genealogy)
+    cloud = Cloud(state.particles, state.log_weights, state.window, state.islands)
     cloud, _ = cloud.resampled(np.exp(state.log_weights), count, prepared.key(state.control.interval, _TRIAL))
-    own, few = replace(prepared, rule=Rule(count, count, None, rule.seed, False)), State(*cloud, *state[4:])
+    own, few = replace(prepared, rule=Rule(count, count, None, rule.seed, False)), State(*cloud[:4], *state[4:])
     figures = []
     for one, before in ((own, few), (own.plain, drawn_at_start(own, few))):
         control = before.control._replace(
@@ -74,20 +75,29 @@ def _saves_time(prepared: Prepared, k: int, state: State, values: Array) -> bool
         )  # fmt: skip
         before = before._replace(control=control, last_scale=_about(one, before)[1])
         after, info = particle_filter.step(one, k, before, values)
-        failed = not np.isfinite(info.mean).all()
-        loss = np.inf if failed else after.control.losses - before.control.losses
+        loss = _loss(one, after) if np.isfinite(info.mean).all() else np.inf
         figures.append(loss * _work(one, k, (after, info), values))
     return figures[0] <= LATER * figures[1]
 
 
+def _loss(prepared: Prepared, state: State) -> float:
+    """Return the variances of the means of independent draws with the weights of the particles, in the mean of the states."""
+    now = moments_of(prepared.system, state.particles, np.exp(state.log_weights))
+    variance = np.maximum(np.diag(now.cov), 1e-300)
+    return float((state.islands.spread(now.particles).independent / variance).mean())
+
+
 def _work(prepared: Prepared, k: int, done: tuple[State, Info], values: Array) -> float:
     """Return the operations on a particle in an interval as long as k, after interval k and as it was observed."""
-    motion, (state, info) = prepared.motion, done
-    again = state._replace(control=state.control._replace(trusted=0))
-    steps, _ = particle_filter.substeps(prepared, prepared.interval(k), values, again, _about(prepared, state))
+    motion, (state, info), about = prepared.motion, done, _about(prepared, done[0])
     events = state.window.events[state.window.length - 1]
     times = 1.0 + info.health["guided"] + OF_LEVEL * info.health["tempering_levels"]
-    return times * motion.operations(steps.scheme, events.width // max(len(events.rows), 1))
+    width, total = events.width // max(len(events.rows), 1), 0
+    for turn in range(MEASURED):
+        control = state.control._replace(trusted=0, interval=state.control.interval + turn)
+        steps, _ = particle_filter.substeps(prepared, prepared.interval(k), values, state._replace(control=control), about)
+        total += motion.operations(steps.scheme, width)
+    return times * total / MEASURED
 
 
 def _about(prepared: Prepared, state: State) -> tuple[Array, Array]:

@@ -10,14 +10,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from zakai.methods.particles.errors import Genealogy
 from zakai.methods.particles.events import Events
 from zakai.methods.particles.interval import Motion
+from zakai.methods.particles.islands import Islands
 from zakai.methods.particles.programs import Array
 from zakai.methods.particles.window import Window, taken
-from zakai.numerics.particles.population import DEPTH
-
-LAGS = (0, 1, 2, 4, 8, 16)  # resamplings back to the common ancestors by which families of draws are told apart
 
 
 class Piece(NamedTuple):
@@ -32,7 +29,7 @@ class Descent(NamedTuple):
     """The past of M draws.
 
     `windows` by number, with the intervals until their ends; of each draw the number of its window (M,), -1 where nothing is
-    known, its particle (M,) after the interval in question, and its families (lags, M).
+    known, its particle (M,) after the interval in question, and its families (2, M).
     """
 
     windows: dict[int, tuple[int, Window]]
@@ -103,12 +100,6 @@ def own_particles(window: Window, place: int, particle: Array) -> Array:
     return window.ancestors[place][particle] if len(window.ancestors[place]) else particle
 
 
-def families(genealogy: Genealogy, particle: Array, interval: int) -> Array:
-    """Return numbers (lags, M) that particles share with those of one ancestor, by the resamplings back to it."""
-    index, found = particle.astype(np.int64), []
-    for lag in range(DEPTH + 1):
-        if 0 < lag <= min(genealogy.age, DEPTH):
-            index = genealogy.parents[-lag][index].astype(np.int64)
-        if lag in LAGS:
-            found.append(interval * 2**32 + index)
-    return np.array(found)
+def families(islands: Islands, particle: Array, interval: int) -> Array:
+    """Return numbers (2, M) of groups of draws: those of one particle, and those of one island."""
+    return np.array([interval * 2**32 + particle.astype(np.int64), islands.epoch * 2**32 + islands.label[particle]])

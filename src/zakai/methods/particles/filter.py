@@ -2,9 +2,9 @@
 
     x_i <- F(x_i, noise_i);   w_i <- w_i p(z | x_i);   resample where 1 / sum w^2 is below half of the particles
 
-A step whose plain weights leave few particles draws the noise again from the Gaussian posterior of the linearised interval, and
-where that fails too, carries plain particles to the posterior by powers of the likelihood with moves between them.  What is drawn
-depends on the seed, the number of the interval and the particle alone.
+A step whose plain weights leave few particles draws the noise again from the Gaussian posterior of the linearised interval, then
+of the last intervals, and where that fails too, carries plain particles to the posterior by powers of the likelihood with moves
+between them.  What is drawn depends on the seed, the number of the interval and the particle alone.
 
 References:
     Gordon, Salmond and Smith 1993, Novel approach to nonlinear/non-Gaussian Bayesian state estimation.
@@ -15,13 +15,14 @@ References:
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from zakai.methods._protocol import Info
-from zakai.methods.particles.errors import CAUTION, FEW_FAMILIES, Genealogy, of_log_likelihood, variances
+from zakai.methods.particles.block import drawn_again
 from zakai.methods.particles.events import Events, Interval, Observed, with_update
 from zakai.methods.particles.interval import (
     MOST_SUBSTEPS,
@@ -34,17 +35,20 @@ from zakai.methods.particles.interval import (
     Steps,
     steps_of,
 )
+from zakai.methods.particles.islands import CAUTION, FEW_ISLANDS, Islands, regression
 from zakai.methods.particles.moments import moments_of
 from zakai.methods.particles.programs import Array
 from zakai.methods.particles.state import Cloud, Control, Prepared, Rule, State
 from zakai.methods.particles.window import Target, Window, taken
 from zakai.methods.system.escape_of_states import RARE, check_escape
-from zakai.numerics.particles.population import DEPTH, effective, next_power, normalised, systematic
-from zakai.numerics.particles.random import normals, uniform_number
+from zakai.numerics.particles.even import Even, even_normals
+from zakai.numerics.particles.population import effective, next_power, normalised, systematic
+from zakai.numerics.particles.random import uniform_number
 
 NOISE, RESAMPLING, PILOT, GUIDE, MOVE, PRIOR, LEVELS = range(7)  # uses of random numbers
 RESAMPLE_BELOW = 0.5  # effective share of the particles
 GUIDE_BELOW = 0.3  # effective share below which the noise is drawn again from the linearised posterior
+DOUBTFUL = 16  # resamplings after an interval that left few particles, in which standard errors are lower bounds
 TEMPER_BELOW, TEMPER_FLOOR = 0.1, 400  # effective share and number below which powers of the likelihood are taken
 HOPELESS = 0.01  # effective share of the particles below which their number is not raised
 GUIDE_SHARE, FIRST_SHARE = 0.1, 0.2  # of plain noise in draws from the linearised posterior, of an interval and of the prior
@@ -53,13 +57,15 @@ INFORMED = 0.25  # log det of the linearised posterior of the noise, below which
 MOST_LEVELS = 60
 # The past is moved where that pays: by error^2 x time, with N variance of a mean, in variances of the state, as error^2.  What
 # ancestors add to that, beyond what the last move left, is taken away from later steps, and as the ancestors that are lost before
-# a move cannot come back, `MOVE_WORTH` times as much as has added up since the last one counts (error^2 x time of eleven systems
-# is about equal with 8, that of most is more with 2), but no more than the present one adds up to until the state has forgotten
-# it: the share that a step leaves is measured.  That is compared with its cost, both as shares of all so far.  A move waits until
-# it can divide the present loss by `MOVE_GAIN`, and longer where the last one had gained less; what that left is forgotten at a
-# rate.  The cost is counted in normal numbers: those of the window, once and for each sweep by the acceptance of the last, and
-# in a step its own and as many as the rest of it takes.  (Measured: 30 to 38 ns in a move, 0.3 us and 40 ns a number in a step.)
-MOVE_GAIN, MOVE_WORTH, FORGOTTEN, STEP_WORK, LEAST_RATE = 1.5, 4.0, 0.98, 4.0, 0.3
+# a move cannot come back, `MOVE_WORTH` times as much as has added up since the last one counts (error^2 x time of the turn is a
+# third more with 4, of bearings, a falling body and a robot the same), but no more than the present one adds up to until the
+# state has forgotten it: the share that a step leaves is measured.  That is compared with its cost, both as shares of all so far.
+# A move waits until it can divide the present loss by `MOVE_GAIN`, and longer where the last one had gained less; what that left
+# is forgotten at a rate.  The cost is counted in normal numbers: those of the window, once and for each sweep by the acceptance
+# of the last, and in a step its own and as many as the rest of it takes.  (Measured: 30 to 38 ns in a move, 0.3 us and 40 ns a
+# number in a step.)
+MOVE_GAIN, MOVE_WORTH, FORGOTTEN, STEP_WORK, LEAST_RATE = 1.5, 8.0, 0.98, 4.0, 0.3
+TRIED, FEW = 16, 128  # a move is tried on one particle in so many, where these are as many at least
 MOVE_CONTROL = (1.0, 1.2, 4.0, 0.4, 1.0)  # power, change, most sweeps, rho, share
 VARIANCE = 5.0  # that of a mean times N, in variances of the state, that the number of particles is chosen for
 MOST_GROWTH = 4
@@ -84,8 +90,8 @@ def init(prepared: Prepared, prior: Any) -> State:
 
 def begun(prepared: Prepared, gaussian: tuple[Array, Array], count: int) -> State:
     """Return draws of a Gaussian with a mean (n,) and a root (n, d) of its covariance."""
-    first = np.empty((gaussian[1].shape[1], count))
-    normals(prepared.key(0, PRIOR), 0, count, first)
+    first, islands = np.empty((gaussian[1].shape[1], count)), Islands.begin(count, prepared.model.n)
+    even_normals(islands.even(prepared.key(0, PRIOR), islands.rank), 0, count, first)
     return _at_start(prepared, np.ascontiguousarray(gaussian[0][:, None] + gaussian[1] @ first), first, gaussian)
 
 
@@ -100,15 +106,15 @@ def _at_start(prepared: Prepared, particles: Array, first: Array, gaussian: tupl
     width = system.law.width if system.law is not None else system.factor.width  # type: ignore[union-attr]
     window = Window.begin(particles, first, gaussian, (width, len(prepared.motion.law[3])))
     logs, n = np.full(count, -np.log(count)), prepared.model.n
-    genealogy, control = Genealogy.begin(count, n), Control(variance=VARIANCE * count / prepared.rule.particles)
-    return State(particles, logs, window, genealogy, control, np.zeros(n), np.zeros(system.n), np.ones(system.n))
+    islands, control = Islands.begin(count, n), Control(variance=VARIANCE * count / prepared.rule.particles)
+    return State(particles, logs, window, islands, control, np.zeros(n), np.zeros(system.n), np.ones(system.n))
 
 
 def reduced(state: State) -> State:
     """Return a state with its particles, without their past."""
     nothing = np.zeros((len(state.particles), 0))
     window = Window.begin(nothing, np.zeros((0, 0)), (np.zeros(0), np.zeros((0, 0))), (0, 0))
-    return state._replace(window=window, genealogy=Genealogy.begin(0, state.genealogy.excess.shape[1]))
+    return state._replace(window=window, islands=Islands.begin(0, len(state.islands.excess)))
 
 
 class Advanced(NamedTuple):
@@ -160,20 +166,21 @@ def _step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[Stat
     check_escape(prepared, k, at_start, infinity=False)
     motion, interval, control = prepared.motion, prepared.interval(k), state.control
     number, rule = control.interval + 1, prepared.rule
-    cloud = Cloud(state.particles, state.log_weights, state.window, state.genealogy)
+    cloud = Cloud(state.particles, state.log_weights, state.window, state.islands)
     scale = np.maximum(system.scales(before.cov), 1e-12)
     observed = _observed(prepared, interval, values)
     wanted, size = _wanted(rule, len(weights), control.variance), effective(weights)
     if size < HOPELESS * len(weights):  # more of them would be of no use
         wanted = min(wanted, len(weights))
-    if size < RESAMPLE_BELOW * len(weights):  # a change of their number alone would resample weights that the next may undo
-        cloud, _ = cloud.resampled(weights, wanted, prepared.key(number, RESAMPLING))
+    # A change of their number alone would resample weights that the next may undo.
+    count = wanted if size < RESAMPLE_BELOW * len(weights) else None
+    cloud, rank = cloud.ordered(before.particles, count, prepared.key(number, RESAMPLING))
     start, narrow = cloud, control.narrow
     for last_turn in (False, True):
         # Errors are measured in deviations after the observation, by how much the last one, or this one, has narrowed them.
         steps, control = substeps(prepared, interval, values, state, (before.mean, narrow * scale))
         events = with_update(motion.events(interval, steps.scheme, values, before.mean, scale), system, observed)
-        done = _advanced(prepared, start, events, observed, number)
+        done = _advanced(prepared, start, events, observed, number, rank)
         after = moments_of(system, done.cloud.particles, done.weights)
         found_narrow = _narrowing(after.cov, done.deviations)
         if last_turn or steps.error * narrow <= REPEATED * _allowed(control, len(weights)) * found_narrow:
@@ -188,35 +195,42 @@ def _step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[Stat
     cloud = cloud._replace(window=cloud.window.appended(motion, events, observed, done.noise, ends))
     weights, cov = done.weights, after.cov
     size, largest = effective(weights), float(weights.max())
-    found = variances(cloud.genealogy, after.particles)
-    genealogy, T = cloud.genealogy.carried(state.genealogy.age, before.particles, after.particles)
-    genealogy, variance = genealogy.seen(found, after.particles)
-    cloud, end = cloud._replace(genealogy=genealogy), after
+    T, end = regression(before.particles, after.particles, cloud.parents), after
+    cloud = cloud._replace(islands=cloud.islands.carried(T), parents=None)
+    found = cloud.islands.spread(after.particles)
     doubtful = size < TEMPER_BELOW * len(weights) or done.levels > 3
     acceptance, moved = done.acceptance, 0.0
-    loss, own_loss = (_loss(part, cov, len(weights)) for part in (found.largest, found.means[0]))
+    own = found.independent
     if done.unseen:  # what is lost now does not come back by the noise of later intervals
-        own_loss = min(own_loss, 1.0)
+        own = np.minimum(own, np.diag(cov) / len(weights))
+    error, own_loss, loss = (_loss(part, cov, len(weights)) for part in (found.variance, own, np.maximum(found.variance, own)))
     present, floor = max(loss - own_loss - control.floor, 0.0), FORGOTTEN * control.floor
     excess, known = control.excess + present, FORGOTTEN * control.known + control.present
     remembered = FORGOTTEN * control.remembered + min(control.present, present)
     future = present * known / (known - remembered) if remembered < known else np.inf
-    losses, work, rate = control.losses + loss, control.work + STEP_WORK + len(done.noise), control.rate
+    losses, work, rate = control.losses + error, control.work + STEP_WORK + len(done.noise), control.rate
     cost = cloud.window.width * (1.0 + MOVE_CONTROL[1] / max(rate, LEAST_RATE))
     worth = min(MOVE_WORTH * excess, future)
     if loss > MOVE_GAIN * (own_loss + floor) and worth * work > cost * losses and cloud.window.width:
-        cloud, acceptance, doubtful_move = _moved(prepared, cloud, weights, number)
-        weights = np.exp(cloud.logs)
-        end, genealogy = moments_of(system, cloud.particles, weights), cloud.genealogy
-        if len(cloud.window.first) and not doubtful_move:
-            genealogy = genealogy.renewed()
-        found, cov = variances(genealogy, end.particles), end.cov
-        genealogy, _ = genealogy.carried(genealogy.age - 1, after.particles, end.particles)
-        genealogy, variance = genealogy.seen(found, end.particles)
-        excess, present, work, moved, rate = 0.0, 0.0, work + cost, 1.0, acceptance
-        remains = _loss(found.largest, cov, len(weights))
-        floor = (remains - _loss(found.means[0], cov, len(weights))) * max(1.0, MOVE_GAIN * remains / loss) ** 2
-        doubtful = doubtful or doubtful_move
+
+        def gains(T: Array) -> bool:  # where T of the deviations is left
+            return MOVE_GAIN * _loss(np.diag(T @ found.cov @ T.T) + own, cov, len(weights)) < loss
+
+        cloud, accepted, change = _moved(prepared, cloud, weights, number, gains)
+        remains, work, excess = loss, work + cost / TRIED, 0.0
+        if change is not None:
+            weights = np.exp(cloud.logs)
+            end = moments_of(system, cloud.particles, weights)
+            islands, cov = cloud.islands.carried(regression(after.particles, end.particles, cloud.parents)), end.cov
+            acceptance, doubtful_move = accepted, accepted < 0.1 or change < 0.5
+            if len(cloud.window.first) and not doubtful_move:
+                islands = islands.renewed()
+            cloud, found = cloud._replace(islands=islands), islands.spread(end.particles)
+            present, work, moved, rate = 0.0, work + cost, 1.0, acceptance
+            own_loss = _loss(found.independent, cov, len(weights))
+            remains = _loss(np.maximum(found.variance, found.independent), cov, len(weights))
+            doubtful = doubtful or doubtful_move
+        floor = (remains - own_loss) * max(1.0, MOVE_GAIN * remains / loss) ** 2
     # What the weights say of a coordinate makes a shift of the prediction smaller by the ratio of the variances.
     contraction = np.where(done.predicted > 0, np.minimum(1.0, end.spread / np.maximum(done.predicted, 1e-300)) ** 2, 1.0)[:n]
     carried, fresh = T @ state.shift, steps.shift[:n]
@@ -224,17 +238,19 @@ def _step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[Stat
     # A shifted prediction changes the log density of an observation by the shift times an innovation.
     shifts = (predicted / np.maximum(done.deviations, 1e-300)) ** 2 * (1.0 - contraction)
     shifted, shift = control.shifted + float(shifts.max()), carried + contraction * fresh
-    genealogy, evidence = of_log_likelihood(genealogy, found)
-    cloud, evidence = cloud._replace(genealogy=genealogy), evidence + shifted
+    islands, variance = cloud.islands, found.variance
+    evidence, families = islands.settled + found.evidence + shifted, islands.families(end.particles)
     spread = end.deviations
     positive = np.where(spread > 0, spread, np.inf)
-    share, random_error = found.largest / positive**2, float(np.sqrt((variance / positive**2).max()))
-    until = cloud.genealogy.age + DEPTH if doubtful else control.doubtful_until
-    marked = doubtful or genealogy.age < until or found.counts[1, -2] < FEW_FAMILIES or not found.forgotten(end.particles)
+    share = variance / positive**2
+    random_error = float(np.sqrt(share.max()))
+    doubtful = doubtful or found.effective < FEW_ISLANDS
+    until = islands.age + DOUBTFUL if doubtful else control.doubtful_until
+    marked = islands.age < until or not families.forgotten
     health = {
         "effective_sample_size": size,
         "particles": float(len(weights)),
-        "founders": float(found.counts[1, -1]),
+        "founders": float(families.number),
         "largest_weight": largest,
         "tempering_levels": float(done.levels),
         "acceptance": acceptance,
@@ -253,7 +269,7 @@ def _step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[Stat
         doubtful_until=until, shifted=shifted, present=present, known=known, remembered=remembered,
         variance=0.8 * control.variance + 0.2 * len(weights) * float(share.mean()),
     )  # fmt: skip
-    return State(cloud.particles, cloud.logs, cloud.window, cloud.genealogy, control, shift, *last), info
+    return State(cloud.particles, cloud.logs, cloud.window, islands, control, shift, *last), info
 
 
 def _allowed(control: Control, count: int) -> float:
@@ -318,12 +334,15 @@ def _observed(prepared: Prepared, interval: Interval, values: Array) -> Observed
     return Observed(t, row, np.array([float(len(late) > 0)]))
 
 
-def _advanced(prepared: Prepared, cloud: Cloud, events: Events, observed: Observed, number: int) -> Advanced:
-    """Return the particles after an interval and its observation."""
+def _advanced(
+    prepared: Prepared, cloud: Cloud, events: Events, observed: Observed, number: int, rank: Array
+) -> Advanced:
+    """Return the particles, with these numbers (N,) within their islands, after an interval and its observation."""
     system, count = prepared.system, len(cloud.logs)
     single = (np.array([observed.time]), observed.given[None], observed.counted[None])
     target = Target(prepared.motion, events, *single, None, cloud.particles)
-    (noise, particles, seen, logs), lost = target.propagate(prepared.key(number, NOISE), system.update is not None)
+    even = cloud.islands.even(prepared.key(number, NOISE), rank)
+    (noise, particles, seen, logs), lost = target.propagate(even, system.update is not None)
     weights = np.exp(cloud.logs)
     moved = moments_of(system, particles, weights)
     before = moments_of(system, seen, weights) if len(seen) else moved
@@ -342,8 +361,15 @@ def _advanced(prepared: Prepared, cloud: Cloud, events: Events, observed: Observ
     gaussian = _linearised(target, cloud, plain)
     if gaussian is not None and not moving and not np.isinf(top) and _uninformed(gaussian, 1.0):
         return plain._replace(unseen=True)  # moves of noise of which the observation says nothing would be of no use
-    best = (gaussian and _guided(prepared, target, cloud, plain, gaussian, number)) or Drawn(plain, first, logs, None)
+    even = cloud.islands.even(prepared.key(number, GUIDE), rank)
+    best = (gaussian and _guided(target, cloud, plain, gaussian, even)) or Drawn(plain, first, logs, None)
     size = effective(best.after.weights) if np.isfinite(best.after.gained) else 0.0
+    if size < TEMPER_BELOW * count and not moving:
+        block = drawn_again(cloud.window, np.exp(cloud.logs), target, GUIDE_SHARE, even)
+        found, gained = normalised(cloud.logs + block.logs) if block is not None else (weights, -np.inf)
+        if block is not None and np.isfinite(gained) and effective(found) > max(size, TEMPER_BELOW * count):
+            after = cloud._replace(particles=block.particles, logs=cloud.logs + block.logs - gained, window=block.window)
+            return plain._replace(cloud=after, weights=found, gained=gained, noise=block.noise, guided=True)
     if size >= min(TEMPER_BELOW * count, TEMPER_FLOOR) or not np.isfinite(best.logs).any():
         return best.after
     return _tempered(prepared, target, cloud, best, number)
@@ -380,16 +406,14 @@ def _uninformed(gaussian: Any, wider: float) -> bool:
     return bool(np.log(gaussian[4] * np.sqrt(wider)).sum() < INFORMED)
 
 
-def _guided(
-    prepared: Prepared, target: Target, cloud: Cloud, plain: Advanced, gaussian: Any, number: int
-) -> Drawn | None:
+def _guided(target: Target, cloud: Cloud, plain: Advanced, gaussian: Any, even: Even) -> Drawn | None:
     """Return the particles whose noise is drawn from the linearised posterior, None where that is no better."""
     moving = target.prior is not None
     d0 = len(cloud.window.first) if moving else 0
     if _uninformed(gaussian, FIRST_WIDER if moving else 1.0):
         return None
     share = FIRST_SHARE if moving else GUIDE_SHARE
-    path, ratio = target.draw(gaussian, share, prepared.key(number, GUIDE))
+    path, ratio = target.draw(gaussian, share, even)
     particles, logs = target.follow(path)
     logs = logs + ratio
     lost = ~np.isfinite(particles).all(axis=0)
@@ -399,7 +423,7 @@ def _guided(
     if not np.isfinite(top) or np.isfinite(plain.gained) and effective(found) <= effective(plain.weights):
         return None
     window = cloud.window._replace(first=np.ascontiguousarray(path[:d0])) if moving else cloud.window
-    after = Cloud(particles, cloud.logs + logs - top, window, cloud.genealogy)
+    after = cloud._replace(particles=particles, logs=cloud.logs + logs - top, window=window)
     done = plain._replace(cloud=after, weights=found, gained=top, noise=np.ascontiguousarray(path[d0:]), guided=True)
     return Drawn(done, path, logs, gaussian)
 
@@ -427,7 +451,7 @@ def _tempered(prepared: Prepared, target: Target, cloud: Cloud, drawn: Drawn, nu
         path, particles, logs, rate, _ = target.sweep(gaussian, path, (high, *control, 0.4, share), own)
         rates.append(rate)
     window = cloud.window._replace(first=np.ascontiguousarray(path[:d0])) if moving else cloud.window
-    after = Cloud(particles, cloud.logs, window, cloud.genealogy)
+    after = cloud._replace(particles=particles, window=window)
     noise, guided = np.ascontiguousarray(path[d0:]), fixed is not None
     spreads, weights = (drawn.after.predicted, drawn.after.deviations), np.exp(cloud.logs)
     return Advanced(after, weights, gained, noise, *spreads, levels, guided, float(np.mean(rates)), drawn.after.lost)
@@ -440,17 +464,30 @@ def _loss(variance: Array, cov: Array, count: int) -> float:
     return float((variance[wide] / spread[wide]).mean()) * count if wide.any() else 0.0
 
 
-def _moved(prepared: Prepared, cloud: Cloud, weights: Array, number: int) -> tuple[Cloud, float, bool]:
-    """Return equally weighted particles whose past has been moved, the acceptance, and whether they have moved too little."""
-    cloud, _ = cloud.resampled(weights, len(weights), prepared.key(number, RESAMPLING, MOST_LEVELS + 1))
+def _moved(
+    prepared: Prepared, cloud: Cloud, weights: Array, number: int, gains: Callable[[Array], bool]
+) -> tuple[Cloud, float, float | None]:
+    """Return equally weighted particles whose past has been moved, the acceptance, and the change of the noise.
+
+    A few particles are moved first.  The cloud and no change are returned where what they keep of their states, T (n, n), says
+    that a move gains too little: moves do not cross between modes.
+    """
+    before, count = cloud, len(weights)
+    cloud, _ = cloud.resampled(weights, count, prepared.key(number, RESAMPLING, MOST_LEVELS + 1))
     path, start = cloud.window.path()
     target = cloud.window.target(prepared.motion, start)
     gaussian = target.gaussian(path, None)
     if gaussian is None:
-        return cloud, 0.0, True
+        return before, np.nan, None
+    if count >= TRIED * FEW:
+        few = slice(None, None, TRIED)
+        trial, states = replace(target, start=np.ascontiguousarray(start[:, few])), [cloud.particles[:, few]]
+        states.append(trial.sweep(gaussian, np.ascontiguousarray(path[:, few]), MOVE_CONTROL, prepared.key(number, MOVE, 1))[1])
+        equal = np.full(states[0].shape[1], 1.0 / states[0].shape[1])
+        if not gains(regression(*(moments_of(prepared.system, x, equal).particles for x in states))):
+            return before, np.nan, None
     path, particles, _, rate, change = target.sweep(gaussian, path, MOVE_CONTROL, prepared.key(number, MOVE))
-    window = cloud.window.moved(path, start, particles)
-    return cloud._replace(particles=particles, window=window), rate, rate < 0.1 or change < 0.5
+    return cloud._replace(particles=particles, window=cloud.window.moved(path, start, particles)), rate, change
 
 
 def _wanted(rule: Rule, count: int, variance: float) -> int:

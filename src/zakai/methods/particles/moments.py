@@ -15,10 +15,10 @@ def moments(particles: Array, weights: Array, angles: Array) -> tuple[Array, Arr
     """Return the mean (n,), the deviations from it (n, N), and the covariance (n, n); angles have their mean direction."""
     n = len(particles)
     mean, deviations, cov = np.empty(n), np.empty(particles.shape), np.empty((n, n))
+    particles = np.ascontiguousarray(particles)
     if angles.any():
-        x, y = (function(particles[angles]) @ weights for function in (np.cos, np.sin))
-        mean[angles] = np.where(np.hypot(x, y) < 1e-9, 0.0, np.arctan2(y, x))
-    population.moments(np.ascontiguousarray(particles), weights, angles, mean, deviations, cov)
+        population.mean_directions(particles, weights, angles, mean)
+    population.moments(particles, weights, angles, mean, deviations, cov)
     return mean, deviations, cov
 
 

@@ -8,9 +8,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from zakai.methods.particles.errors import Genealogy
 from zakai.methods.particles.events import Interval
 from zakai.methods.particles.interval import Motion
+from zakai.methods.particles.islands import UNEVEN, Islands
+from zakai.methods.particles.moments import Weighted
 from zakai.methods.particles.programs import Array
 from zakai.methods.particles.system import System, system_of
 from zakai.methods.particles.window import Window, taken
@@ -56,30 +57,54 @@ class Control(NamedTuple):
 
 
 class Cloud(NamedTuple):
-    """Particles with their past while a step works on them."""
+    """Particles with their past while a step works on them.
+
+    `parents` (N,) are those at the beginning of the step, None where these are the same.
+    """
 
     particles: Array
     logs: Array
     window: Window
-    genealogy: Genealogy
+    islands: Islands
+    parents: Array | None = None
 
     def resampled(self, weights: Array, count: int, key: Array) -> tuple[Cloud, Array]:
         """Return equally weighted particles by systematic resampling, and their ancestors."""
         ancestors = np.empty(count, np.int32)
         systematic(weights, uniform_number(key), ancestors)
-        return self.taken(ancestors, weights), ancestors
+        return self._taken(ancestors, self.islands.resampled(ancestors, ancestors)), ancestors
 
-    def taken(self, ancestors: Array, weights: Array) -> Cloud:
+    def ordered(self, now: Weighted, count: int | None, key: Array) -> tuple[Cloud, Array]:
+        """Return the particles, resampled to `count` where that is a number, and their numbers (N,) in order within islands."""
+        islands, size = self.islands, len(now.weights)
+        if count is None:
+            rank = np.empty(size, np.int32)
+            rank[islands.order(now, False)] = islands.rank
+            return self, rank
+        spread = islands.spread(now)
+        uneven = spread.effective < UNEVEN
+        order, places = islands.order(now, uneven), np.empty(count, np.int32)
+        systematic(now.weights[order], uniform_number(key), places)
+        ancestors = order[places].astype(np.int32)
+        if uneven:
+            islands, deal = islands.dealt(spread, count)
+            ancestors = ancestors[deal]
+            islands = islands._replace(founders=islands.founders[ancestors], age=islands.age + 1)
+        else:
+            islands = islands.resampled(places, ancestors)
+        return self._taken(ancestors, islands), islands.rank
+
+    def _taken(self, ancestors: Array, islands: Islands) -> Cloud:
         """Return equally weighted particles with these ancestors."""
         logs = np.full(len(ancestors), -np.log(len(ancestors)))
-        window, genealogy = self.window.resampled(ancestors), self.genealogy.resampled(ancestors, weights)
-        return Cloud(taken(self.particles, ancestors), logs, window, genealogy)
+        parents = ancestors if self.parents is None else self.parents[ancestors]
+        return Cloud(taken(self.particles, ancestors), logs, self.window.resampled(ancestors), islands, parents)
 
 
 class State(NamedTuple):
     """The weighted particles and what continues them.
 
-    `particles` (n, N), `log_weights` (N,) that sum to one, the past, the ancestors, the controls, `shift` (n,), the error of the
+    `particles` (n, N), `log_weights` (N,) that sum to one, the past, the islands, the controls, `shift` (n,), the error of the
     mean by the time step, `last_shift` (n,), that of the last interval in which it was measured, and `last_scale` (n,), the
     standard deviations in which it was measured.
     """
@@ -87,7 +112,7 @@ class State(NamedTuple):
     particles: Array
     log_weights: Array
     window: Window
-    genealogy: Genealogy
+    islands: Islands
     control: Control
     shift: Array
     last_shift: Array

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
+from zakai.methods.particles.islands import Islands
 from zakai.methods.particles.programs import Array
 from zakai.methods.particles.state import Prepared, State
 from zakai.methods.particles.window import INTERVALS, Window
 from zakai.numerics.particles.motion import UPDATE
-from zakai.numerics.particles.population import DEPTH
 
 
 def valid(prepared: Prepared, state: State) -> bool:
@@ -18,28 +18,20 @@ def valid(prepared: Prepared, state: State) -> bool:
     shapes = shapes and state.last_shift.shape == state.last_scale.shape == (n,)
     control = state.control
     shapes = shapes and control.stages in (2, 4) and control.interval >= 0 and control.trusted >= 0
-    return count > 0 and shapes and _window(prepared, state.window, count) and _genealogy(state, count, prepared.model.n)
+    return count > 0 and shapes and _window(prepared, state.window, count) and _islands(state.islands, count, prepared.model.n)
 
 
 def _within(index: Array, count: int) -> bool:
     return bool(index.size == 0 or (index.min() >= 0 and index.max() < count))
 
 
-def _genealogy(state: State, count: int, n: int) -> bool:
-    genealogy = state.genealogy
-    if not (0 <= genealogy.born <= genealogy.age and 0 <= genealogy.done and genealogy.first > 0):
+def _islands(islands: Islands, count: int, n: int) -> bool:
+    bounds, founders = islands.bounds, islands.founders
+    if bounds.ndim != 1 or len(bounds) < 3 or bounds[0] != 0 or bounds[-1] != count or (np.diff(bounds) < 0).any():
         return False
-    if genealogy.excess.shape != (DEPTH + 1, n, n):
+    if islands.excess.shape != (n, n) or islands.age < 0 or islands.epoch < 0 or islands.first < 1:
         return False
-    if genealogy.founders.shape != (count,) or not _within(genealogy.founders, genealogy.first):
-        return False
-    later = count
-    for back in range(1, min(genealogy.age, DEPTH) + 1):
-        parents, size = genealogy.parents[-back], genealogy.sizes[-back]
-        if parents.shape != (later,) or size < 1 or not _within(parents, size):
-            return False
-        later = size
-    return True
+    return founders.shape == (count,) and _within(founders, islands.first)
 
 
 def _window(prepared: Prepared, window: Window, count: int) -> bool:

@@ -17,6 +17,7 @@ from zakai.methods.particles.programs import Array
 from zakai.methods.particles.system import root
 from zakai.numerics.particles import moves
 from zakai.numerics.particles.chunks import CHUNK, over_chunks
+from zakai.numerics.particles.even import Even
 
 INTERVALS = 64  # of a window
 # Normal numbers of a particle in a window, at least and at most: a move costs their square.  Between these it is as many as all
@@ -157,6 +158,47 @@ class Window(NamedTuple):
         window = before.moved(path, start, ends[-1])
         return window._replace(ends=(*ends, *before.ends[length:]))
 
+    def last(self, motion: Motion, count: int) -> tuple[Window, Array, Array]:
+        """Return the past of the particles in the last intervals.
+
+        Returns:
+            The window without ancestors and states in them, the states (n, N) before them, and the noise (D, N) in them.
+        """
+        place, index, noises = self.length - count, None, list[Array]()
+
+        def own(columns: Array) -> Array:
+            return columns if index is None else taken(columns, index)
+
+        def before(k: int) -> Array | None:
+            ancestors = self.ancestors[k]
+            return index if not len(ancestors) else ancestors if index is None else ancestors[index]
+
+        for k in reversed(range(place, self.length)):
+            index = before(k)
+            noises.append(own(self.noises[k]))
+        none, window = (_EMPTY,) * INTERVALS, self
+        if place == 0:
+            start = own(self.mean[:, None] + self.root @ self.first if len(self.first) else self.start)
+            window = self._replace(start=own(self.start), first=own(self.first))
+        else:
+            index, end = before(place - 1), self.ends[place - 1]
+            if not end.size:
+                end = self.part(motion, np.arange(self.noises[place - 1].shape[1]), place).ends[place - 1]
+            start = own(end)
+            window = self._replace(ancestors=_with(self.ancestors, place - 1, _EMPTY if index is None else index))
+        nothing = (np.zeros((0, 0)),) * len(none[place:])
+        window = window._replace(ancestors=(*window.ancestors[:place], *none[place:]), ends=(*self.ends[:place], *nothing))
+        return window, np.ascontiguousarray(start), np.concatenate(noises[::-1])
+
+    def with_noise(self, count: int, path: Array) -> Window:
+        """Return the window with this noise (D, N) in the last intervals."""
+        noises, place = list(self.noises), 0
+        for k in range(self.length - count, self.length):
+            size = len(noises[k])
+            noises[k] = np.ascontiguousarray(path[place : place + size])
+            place += size
+        return self._replace(noises=tuple(noises))
+
     def target(self, motion: Motion, start: Array) -> Target:
         """Return what the noise of this window must follow."""
         prior = (self.mean, self.root) if len(self.first) else None
@@ -233,12 +275,12 @@ class Target:
         prior = self.prior or (np.zeros(n), np.zeros((n, 0)))
         return moves.WindowLaw(self.motion.arrays, tuple(self.events), observed, prior)
 
-    def propagate(self, key: Array, update: bool) -> tuple[moves.Advance, int]:
+    def propagate(self, even: Even, update: bool) -> tuple[moves.Advance, int]:
         """Return the particles after noise that is drawn, and how many are lost; with `update` those before the last one, too."""
         n, count = self.start.shape
         noise, states, seen = (np.empty((rows, count)) for rows in (self.events.width, n, n if update else 0))
         after, arrays = moves.Advance(noise, states, seen, np.empty(count)), self.arrays
-        lost = over_chunks(lambda low, high: moves.propagate(arrays, key, self.start, low, high, after), count)
+        lost = over_chunks(lambda low, high: moves.propagate(arrays, even, self.start, low, high, after), count)
         return after, sum(lost)
 
     def follow(self, path: Array) -> tuple[Array, Array]:
@@ -248,11 +290,11 @@ class Target:
         over_chunks(lambda low, high: moves.follow(arrays, self.start, path, low, high, out, total), len(total))
         return out, total
 
-    def draw(self, gaussian: Any, share: float, key: Array) -> tuple[Array, Array]:
+    def draw(self, gaussian: Any, share: float, even: Even) -> tuple[Array, Array]:
         """Return noise (D, N) of which a share is drawn from N(0, I), and log N(0, I) less the log of its density (N,)."""
         count = self.start.shape[1]
         path, ratio = np.empty((len(gaussian[0]), count)), np.empty(count)
-        over_chunks(lambda low, high: moves.draw(gaussian, share, key, self.start, low, high, path, ratio), count)
+        over_chunks(lambda low, high: moves.draw(gaussian, share, even, self.start, low, high, path, ratio), count)
         return path, ratio
 
     def sweep(

@@ -24,9 +24,10 @@ from zakai.numerics.compiled import helper, kernel
 from zakai.numerics.formula_kernel import BLOCK
 from zakai.numerics.particles.chunks import CHUNK
 from zakai.numerics.particles.elementary import add_rows
+from zakai.numerics.particles.even import EVEN, fill_even
 from zakai.numerics.particles.formulas import F1, F2, PROGRAM, block_of, load_point, run_program
 from zakai.numerics.particles.motion import EVENTS, MOTION, buffers_of, run_event
-from zakai.numerics.particles.random import KEY, fill_normals, fill_row, uniform
+from zakai.numerics.particles.random import KEY, fill_row, uniform
 
 Array = Any
 # The law, and of each observation its time (I,), given numbers (I, L), and which terms count (I, terms).
@@ -210,8 +211,8 @@ def follow(window: Any, start: Array, path: Array, low: int, high: int, out: Arr
             total[first + i] = found[i]
 
 
-@kernel(types.int64(WINDOW_LAW, KEY, F2, types.int64, types.int64, ADVANCE))
-def propagate(window: Any, key: Array, start: Array, low: int, high: int, after: Any) -> int:
+@kernel(types.int64(WINDOW_LAW, EVEN, F2, types.int64, types.int64, ADVANCE))
+def propagate(window: Any, even: Any, start: Array, low: int, high: int, after: Any) -> int:
     """Advance the particles (n, N) from `low` to `high` by an interval with noise that is drawn; return how many are lost."""
     noise, states, seen, gained = after
     n, D, lost = start.shape[0], noise.shape[0], 0
@@ -220,7 +221,7 @@ def propagate(window: Any, key: Array, start: Array, low: int, high: int, after:
     own, begin, at = np.empty((D + 1, BLOCK)), np.empty((n, BLOCK)), np.empty((seen.shape[0], BLOCK))
     for first in range(low, high, BLOCK):
         size = min(BLOCK, high - first)
-        fill_normals(key, first, size, own[:D])
+        fill_even(even, first, size, own[:D])
         for d in range(n):
             for i in range(size):
                 begin[d, i] = start[d, first + i]
@@ -255,8 +256,8 @@ def propagate(window: Any, key: Array, start: Array, low: int, high: int, after:
     return lost
 
 
-@kernel(types.void(GAUSSIAN, types.float64, KEY, F2, types.int64, types.int64, F2, F1))
-def draw(gaussian: Any, share: float, key: Array, start: Array, low: int, high: int, path: Array, ratio: Array) -> None:
+@kernel(types.void(GAUSSIAN, types.float64, EVEN, F2, types.int64, types.int64, F2, F1))
+def draw(gaussian: Any, share: float, even: Any, start: Array, low: int, high: int, path: Array, ratio: Array) -> None:
     """Write noise (D, N) drawn from share N(0, I) + (1 - share) N(m, U^-2), and log N(0, I) less the log of that density."""
     n, D, along = start.shape[0], path.shape[0], np.empty((gaussian[4].size, BLOCK))
     w, p, m = np.empty((D, BLOCK)), np.empty((D, BLOCK)), np.empty((D, BLOCK))
@@ -266,13 +267,13 @@ def draw(gaussian: Any, share: float, key: Array, start: Array, low: int, high: 
         log_det += math.log(factor)
     for first in range(low, high, BLOCK):
         size = min(BLOCK, high - first)
-        fill_normals(key, first, size, w)
+        fill_even(even, first, size, w)
         for d in range(n):
             for i in range(size):
                 begin[d, i] = start[d, first + i]
         _mean(gaussian, begin, m, size)
         for i in range(size):
-            plain[i] = uniform(key, _ACCEPTANCE + np.uint64(first + i)) < share
+            plain[i] = uniform(even.key, _ACCEPTANCE + np.uint64(first + i)) < share
         for r in range(D):
             for i in range(size):
                 p[r, i] = w[r, i]

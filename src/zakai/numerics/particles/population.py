@@ -1,4 +1,4 @@
-"""Weights, resampling, and the families of particles that share an ancestor."""
+"""Weights, resampling, moments, and the sums of groups of particles."""
 
 from __future__ import annotations
 
@@ -8,14 +8,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from numba import types
 
-from zakai.numerics.compiled import helper, kernel
+from zakai.numerics.compiled import kernel
 from zakai.numerics.formula_kernel import BLOCK
+from zakai.numerics.particles.elementary import sin_row
 from zakai.numerics.particles.formulas import F1, F2, F3
 from zakai.numerics.particles.noise import root_of
-from zakai.numerics.small_matrices import congruence
 
 Array = Any
-DEPTH = 16  # resamplings that are looked back
 _NEGLIGIBLE = 40.0  # of the logarithm of a weight, below the largest
 I4, I8 = types.int32[::1], types.int64[::1]
 
@@ -32,6 +31,25 @@ def systematic(weights: Array, offset: float, out: Array) -> None:
     while j < count:
         out[j] = weights.size - 1
         j += 1
+
+
+@kernel(types.void(F2, F1, types.boolean[::1], F1))
+def mean_directions(x: Array, weights: Array, angles: Array, mean: Array) -> None:
+    """Write the mean directions of those rows of weighted particles (n, N) that are angles; zero where there is none."""
+    n, count = x.shape
+    sines, cosines = np.empty(BLOCK), np.empty(BLOCK)
+    for d in range(n):
+        if not angles[d]:
+            continue
+        along, across = 0.0, 0.0
+        for first in range(0, count, BLOCK):
+            size = min(BLOCK, count - first)
+            sin_row(x[d, first : first + size], 0, sines[:size])
+            sin_row(x[d, first : first + size], 1, cosines[:size])
+            for i in range(size):
+                across += weights[first + i] * sines[i]
+                along += weights[first + i] * cosines[i]
+        mean[d] = math.atan2(across, along) if math.hypot(along, across) >= 1e-9 else 0.0
 
 
 @kernel(types.void(F2, F1, types.boolean[::1], F1, F2, F2), reordered=True)
@@ -73,81 +91,34 @@ def moments(x: Array, weights: Array, angles: Array, mean: Array, deviations: Ar
             cov[e, d] = cov[d, e]
 
 
-@helper
-def _joined(index: Array, labels: Array, count: int, families: Any) -> int:
-    """Join neighbours whose labels have equal entries in a list, replace the labels, and return how many families are left."""
-    mass, sums, member = families
-    kept = -1
-    for place in range(count):
-        label = index[labels[place]]
-        if kept >= 0 and labels[kept] == label:
-            mass[kept] += mass[place]
-            for d in range(sums.shape[1]):
-                sums[kept, d] += sums[place, d]
-            continue
-        kept += 1
-        labels[kept], mass[kept], member[kept] = label, mass[place], member[place]
-        for d in range(sums.shape[1]):
-            sums[kept, d] = sums[place, d]
-    return kept + 1
+@kernel(types.void(I8, F1, F2, F2, F1, F1), reordered=True)
+def sums_of_islands(bounds: Array, weights: Array, deviations: Array, sums: Array, masses: Array, independent: Array) -> None:
+    """Write the sums of weights (R,) and of weighted deviations (R, n) of the particles of each island.
 
-
-@kernel(types.void(types.UniTuple(I4, DEPTH), I8, types.int64, I4, F1, F2, types.Tuple((F2, F1, F2))))
-def lineage(
-    parents: Any, sizes: Array, first: int, founders: Array, weights: Array, deviations: Array, out: tuple[Array, Array, Array]
-) -> None:
-    """Write what families of particles tell, by generation, and last for those of the first ancestors.
-
-    Systematic resampling keeps the order of the particles, so that the members of a family are neighbours.
-
-    Args:
-        parents: the ancestors of the last resamplings, newest last.
-        sizes: the particles now, those of each earlier generation, and the first ancestors (lags + 1,).
-        first: the number of the generation of the first ancestors, or more than there are.
-        founders: the first ancestors (N,).
-        weights: of the particles (N,).
-        deviations: of the particles from their mean (n, N).
-        out: receives the variances of the means (lags + 1, n), the variances (n,) of the states between the families of the
-            oldest generation, and the sums of the squares of the masses of families and their numbers (2, lags + 1).
+    `independent` (n,) receives the variances of the means of independent particles with these weights.
     """
-    means, between, counts = out
-    n, count, last = deviations.shape[0], 0, sizes.size - 1
-    labels, member = np.empty(weights.size, np.int32), np.empty(weights.size, np.int32)
-    mass, sums = np.empty(weights.size), np.empty((weights.size, n))
-    for i in range(weights.size):
-        labels[count] = member[count] = i
-        mass[count] = weights[i]
+    n, count = deviations.shape
+    for d in range(n):
+        independent[d] = 0.0
+    for island in range(bounds.size - 1):
+        masses[island] = 0.0
+        for i in range(bounds[island], bounds[island + 1]):
+            masses[island] += weights[i]
         for d in range(n):
-            sums[count, d] = weights[i] * deviations[d, i]
-        count += weights[i] > 0.0
-    for lag in range(last + 1):
-        if lag == last:
-            if first < last:
-                means[lag], counts[:, lag] = means[first], counts[:, first]
-                break
-            for place in range(count):
-                labels[place] = member[place]
-            count = _joined(founders, labels, count, (mass, sums, member))
-        elif lag:
-            count = _joined(parents[DEPTH - lag], labels, count, (mass, sums, member))
-        square, factor = 0.0, sizes[lag] / max(sizes[lag] - 1, 1)
-        for d in range(n):
-            means[lag, d] = 0.0
-        for place in range(count):
-            square += mass[place] * mass[place]
-            for d in range(n):
-                means[lag, d] += factor * sums[place, d] * sums[place, d]
-        counts[0, lag], counts[1, lag] = square, count
-        if lag == last - 1:
-            for d in range(n):
-                between[d] = 0.0
-                for place in range(count):
-                    between[d] += sums[place, d] * sums[place, d] / mass[place]
+            total, square = 0.0, 0.0
+            for i in range(bounds[island], bounds[island + 1]):
+                part = weights[i] * deviations[d, i]
+                total += part
+                square += part * part
+            sums[island, d] = total
+            independent[d] += square
+    for d in range(n):
+        independent[d] *= count / max(count - 1, 1)
 
 
-@kernel(types.void(F3, F2, F2, F2))
-def carry(excess: Array, across: Array, cov: Array, T: Array) -> None:
-    """Write T = across cov^-1 (n, n), in the directions in which particles differ, and replace X (I, n, n) by T X T'.
+@kernel(types.void(F2, F2, F2))
+def carry(across: Array, cov: Array, T: Array) -> None:
+    """Write T = across cov^-1 (n, n), in the directions in which particles differ.
 
     cov^-1 is that of the rows and columns of the pivots of Cholesky's factor, and zero elsewhere.
     """
@@ -167,10 +138,6 @@ def carry(excess: Array, across: Array, cov: Array, T: Array) -> None:
             for j in range(k + 1, rank):
                 total -= R[pivots[j], k] * T[row, pivots[j]]
             T[row, pivots[k]] = total / R[pivots[k], k]
-    product, found = np.empty((n, n)), np.empty((n, n))
-    for i in range(excess.shape[0]):
-        congruence(found, T, excess[i], product)
-        excess[i] = found
 
 
 class Candidates(NamedTuple):

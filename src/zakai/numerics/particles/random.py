@@ -41,14 +41,20 @@ def key_of(*numbers: int) -> Array:
 
 
 @helper
-def uniform(key: Array, counter: Any) -> float:
-    """Return a number in (0, 1) for a counter (uint64)."""
+def hashed(key: Array, counter: Any) -> Any:
+    """Return 64 random bits (uint64) for a counter (uint64)."""
     z = counter * np.uint64(0x9E3779B97F4A7C15) + key[0]
     for _ in range(2):
         z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
         z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
         z = z ^ (z >> np.uint64(31)) ^ key[1]
-    return (float(z >> np.uint64(12)) + 0.5) * 2.0**-52
+    return z
+
+
+@helper
+def uniform(key: Array, counter: Any) -> float:
+    """Return a number in (0, 1) for a counter (uint64)."""
+    return (float(hashed(key, counter) >> np.uint64(12)) + 0.5) * 2.0**-52
 
 
 @helper
@@ -89,10 +95,16 @@ def _outer(r: float) -> float:
 @helper
 def fill_row(key: Array, row: int, first: int, size: int, out: Array) -> None:
     """Write one row (size,) of standard normal numbers for the particles from `first` on; row and particle are the counter."""
-    counter = (np.uint64(row) << np.uint64(32)) + np.uint64(first)
-    p, found, far, places = np.empty(size), np.empty(size), np.empty(size), np.empty(size, np.int64)
+    counter, p = (np.uint64(row) << np.uint64(32)) + np.uint64(first), np.empty(size)
     for i in range(size):
         p[i] = uniform(key, counter + np.uint64(i))
+    write_quantiles(p, size, out)
+
+
+@helper
+def write_quantiles(p: Array, size: int, out: Array) -> None:
+    """Write the quantiles (size,) of the standard normal distribution for probabilities (size,)."""
+    found, far, places = np.empty(size), np.empty(size), np.empty(size, np.int64)
     # Loops without branches are vectorised: most numbers are central, and the others are put together.
     for i in range(size):
         found[i] = _central(p[i])
@@ -112,19 +124,13 @@ def fill_row(key: Array, row: int, first: int, size: int, out: Array) -> None:
         out[i] = found[i]
 
 
-@helper
-def fill_normals(key: Array, first: int, size: int, out: Array) -> None:
-    """Write rows (d, size) of standard normal numbers for the particles from `first` on."""
-    for j in range(out.shape[0]):
-        fill_row(key, j, first, size, out[j])
-
-
 @kernel(types.void(KEY, types.int64, types.int64, types.float64[:, ::1]))
 def normals(key: Array, low: int, high: int, out: Array) -> None:
     """Write the columns from `low` to `high` of standard normal numbers (d, N)."""
     for first in range(low, high, BLOCK):
         size = min(BLOCK, high - first)
-        fill_normals(key, first, size, out[:, first : first + size])
+        for j in range(out.shape[0]):
+            fill_row(key, j, first, size, out[j, first : first + size])
 
 
 def uniform_number(key: Array) -> float:
