@@ -29,6 +29,9 @@ FEW = 8.0  # effective control points of a prediction that a likelihood must lea
 # Times the error in L1, and the exponential of the depth to which a likelihood leads: more is that of a few points, which the
 # likelihood happens to prefer.
 MOST, DEEPEST = 3.0, 10.0
+# Times what chance adds to the square of third derivatives, that is left out: with 1 a body that falls is warned of at four times
+# its error, with 3 two states have an error of three estimates after a long gap.
+CERTAIN = 2.0
 
 
 class Error(NamedTuple):
@@ -62,7 +65,7 @@ class Error(NamedTuple):
         """
         total = parts.sum(axis=1)
         third, chance = total[n + n * n :], float((parts[n + n * n :] ** 2).sum())
-        third = third * max(0.0, 1.0 - chance / max(float(third @ third), 1e-300))
+        third = third * max(0.0, 1.0 - CERTAIN * chance / max(float(third @ third), 1e-300))
         return cls(total[:n], total[n : n + n * n].reshape(n, n), third.reshape(n, n, n), parts[:n] @ parts[:n].T)
 
     def plus(self, other: Error, factor: float = 1.0) -> Error:
