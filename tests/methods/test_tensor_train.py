@@ -315,6 +315,31 @@ def test_the_estimate_holds_where_the_time_step_makes_the_error():
     assert errors_over_estimates(model, zakai.Record(times, np.array(seen)[:, None], "samples")) < 1
 
 
+def test_the_estimate_holds_where_the_noise_is_linearised_over_a_long_interval():
+    model = zakai.Model(
+        state=["x", "y"], drift=["0.665*y", "-0.832*x**3 - 0.202*x - 0.202*y + 0.998*cos(2.967*t)"], diffusion=[[0], [0.694]],
+        observation=["x + y/2"], observation_kind="samples", observation_noise=[[1.031]],
+        prior={"kind": "gaussian", "mean": [-0.154, -0.055], "cov": [[0.0509, -0.0697], [-0.0697, 0.2108]]},
+    )  # fmt: skip
+    times = [0.226, 0.526, 1.219, 3.544, 3.808, 3.922, 4.001, 4.704]
+    seen = [np.nan, -1.737, np.nan, np.nan, 2.243, 2.582, 1.269, 0.06]
+    assert errors_over_estimates(model, zakai.Record(times, np.array(seen)[:, None], "samples")) < 1
+
+
+def test_the_estimate_holds_for_noise_of_a_wide_angle_and_its_rate():
+    model = zakai.Model(
+        state=["x", "y"], drift=["0.689*y", "-0.495*y - 1.018*sin(x)"], diffusion=[[0.177, 0], [0, 0.541]],
+        observation=["cos(x)", "y/2 + sin(x)"], observation_kind="samples", observation_noise=[[1.055, 0], [0, 0.288]],
+        prior={"kind": "gaussian", "mean": [-0.33, -0.158], "cov": [[0.1704, 0], [0, 0.0936]]}, periodic=["x"],
+    )  # fmt: skip
+    times = [0.248, 0.314, 0.369, 0.476, 0.541, 0.707, 0.969, 3.449, 3.515, 3.87, 3.947, 4.698]
+    values = [
+        [1.818, -0.505], [-0.436, -0.847], [2.132, -0.994], [0.027, -1.408], [np.nan, -1.273], [-0.286, 0.008], [1.171, 0.204],
+        [-0.808, 0.641], [0.433, 1.321], [1.341, 1.828], [0.175, 1.167], [1.225, 0.997],
+    ]  # fmt: skip
+    assert errors_over_estimates(model, zakai.Record(times, values, "samples")) < 1
+
+
 def test_the_estimate_holds_for_an_observation_in_the_tails_of_a_density_with_noise_that_depends_on_the_state():
     model = zakai.Model(
         state=["x", "y"], drift=["0.634*y", "-0.281*y - 1.19*sin(x)"], diffusion=[["0.04225*sin(y) + 0.169", 0], [0, 0.562]],

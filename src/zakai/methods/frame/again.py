@@ -64,7 +64,7 @@ def _predicted(chain: Chain, u: Train, halves: tuple[Half, ...]) -> Prediction:
         total = v.mass
         if prepared.system.weighted:
             log_mass += math.log(total) + half.top
-        Q = prepared.motion.noise(interval, chain.values, middle, length, half.about)
+        Q, _ = prepared.motion.noise(interval, chain.values, middle, length, half.about)
         D = _in_frame(Q, v)
         v = v.convolve(np.maximum(np.diag(D), 0.0), FINER * FINER * half.choice.options.tolerance)
         u, at = v.in_basis(np.ascontiguousarray(v.grid.basis @ corrections(D))).scaled(1.0 / total), middle

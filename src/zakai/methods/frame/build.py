@@ -80,10 +80,14 @@ class Builder:
         return self.looser if any(report.capped for report in self.reports) else max(1.0, 0.5 * self.looser)
 
     @property
+    def left(self) -> float:
+        """The error of the mean that an interval may add: less where earlier errors are left."""
+        return self.allowed * min(1.0, max(self.allowed / max(self.error, 1e-300), LEAST))
+
+    @property
     def _tolerance(self) -> float:
         """The error of a build."""
-        tolerance = self.allowed
-        return SHARE * self.share * self.sharper * tolerance * min(1.0, max(tolerance / max(self.error, 1e-300), LEAST))
+        return SHARE * self.share * self.sharper * self.left
 
     @property
     def rule(self) -> Rule:

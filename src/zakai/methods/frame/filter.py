@@ -34,7 +34,7 @@ from zakai.numerics.trains.train import Train, quasi_random
 
 PRIOR_POINTS, BLOCK = 1024, 1024
 # Substeps are chosen for this share of the tolerance.  What is extrapolated has a third to a twentieth of the error.
-SAFETY, GAIN = 0.7, 4.0
+SAFETY, GAIN = 0.5, 4.0
 IN_TAILS = 0.03  # error of a mean over tolerance e^depth: linear tracks with observations 4 and 6 deviations away
 BEYOND = 0.3  # error of a mean over the distance of an observation, where a Gaussian stands for the tails
 OF_MEAN = 0.6  # error of a mean over what a motion loses of the mass and what is near an edge
@@ -281,7 +281,7 @@ def _predicted(chain: Chain, state: State, likelihood: Likelihood) -> Predicted:
     if length <= 0 or (base.affine and base.sampled and not base.driven):
         prediction, count = chain.first(u, 1)
         return Predicted(prediction, count, time, 0.0, nothing)
-    allowed = SAFETY * chain.builder.allowed
+    allowed = SAFETY * chain.builder.left
     guess = length * time.substeps / time.length if time.length > 0 else 1.0
     count = min(max(1, math.ceil(guess - 1e-9)), MOST_SUBSTEPS)
     for _ in range(4):

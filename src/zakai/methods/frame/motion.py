@@ -37,6 +37,7 @@ from zakai.numerics.trains.carried import Likelihood, Path
 from zakai.numerics.trains.kernels import flow
 
 MOST_STEPS = 64  # Runge-Kutta steps of a path; a drift that needs more is not resolved by a substep
+KICK_STEPS = 2  # of Runge-Kutta along a kick of points that measure the time step
 PILOTS = 24  # points by which steps are chosen
 
 
@@ -55,6 +56,7 @@ class System:
             field = list(model.diffusion * sp.Matrix(c))
             spread = sum((without_jumps(part, symbol) for part, symbol in zip(field, model.x, strict=True)), sp.S.Zero)
             f, rate, V = [switch * a + b for a, b in zip(f, field, strict=True)], switch * rate + spread, switch * V
+            self.kick = Expressions([*field, *[sp.S.Zero] * (len(c) + 1)], model, given, more=c)
             given = (*given, switch, *c)
         self.backward = Expressions([*f, rate], model, given)
         self.forward = Expressions([*f, V], model, given)
@@ -161,8 +163,10 @@ class Motion:
             steps, last = 2 * steps, finer
         return steps
 
-    def noise(self, interval: Interval, values: Array, t: float, length: float, about: tuple[Array, Array]) -> Array:
-        """Return the noise (n, n) of a substep, carried to its middle t, where it is linearised about a state (n,).
+    def noise(
+        self, interval: Interval, values: Array, t: float, length: float, about: tuple[Array, Array]
+    ) -> tuple[Array, Array]:
+        """Return the noise (n, n) of a substep, carried to its middle t, and df/dx (n, n) at a state (n,) by which it is carried.
 
         Args:
             interval: the interval.
@@ -178,11 +182,11 @@ class Motion:
             P = base.precision(t, interval.inside, self.theta, u)
         G = coefficients.covariance(t, P, u)
         if base.affine and base.cross is None:
-            return noise_about_middle(coefficients.constant_matrix, G, length)
-        # The value at the interval's end is the limit from inside, as for the flows.
-        given = self.path(interval, t, t + 1e-9 * length, values, 1).given[0, 0]
-        mean, scale = about
-        return noise_about_middle(coefficients.matrix(mean, scale, t, given), G, length)
+            A = coefficients.constant_matrix
+        else:  # the value at the interval's end is the limit from inside, as for the flows
+            given = self.path(interval, t, t + 1e-9 * length, values, 1).given[0, 0]
+            A = coefficients.matrix(*about, t, given)
+        return noise_about_middle(A, G, length), A
 
     def kicks(self, interval: Interval, t: float, length: float) -> list[Array]:
         """Return the coefficients of the fields g (r,) for one deviation of each noise of a substep, in order."""
@@ -210,6 +214,17 @@ class Motion:
         ends = t + length * (np.arange(steps + 1) / steps - 0.5)
         given = np.tile(np.concatenate([row, [0.0], c / abs(length)]), (steps, 2, 1))
         return Path(np.column_stack([ends[:-1], ends[1:]]), np.ascontiguousarray(given))
+
+    def kicked(self, interval: Interval, values: Array, middle: tuple[float, float], c: Array, x: Array) -> Array:
+        """Return points (n, P) after the flows along g c, with numbers c (r, P) of their own; for the rest see `kick`."""
+        t, length = middle
+        row = self.coefficients.given_numbers(interval, np.array([[t, t]]), values)[0, 0]
+        ends = t + length * (np.arange(KICK_STEPS + 1) / KICK_STEPS - 0.5)
+        path = Path(np.column_stack([ends[:-1], ends[1:]]), np.ascontiguousarray(np.tile(row, (KICK_STEPS, 2, 1))))
+        start = np.concatenate([x, c / length])
+        out = np.empty((len(start) + 1, x.shape[1]))
+        flow(tuple(self.system.kick.at(self.theta)), self.box, tuple(path), start, out)
+        return out[: len(x)]
 
     def likelihood(self, interval: Interval, values: Array) -> Likelihood:
         """Return the law of what is observed at the end of an interval; no term counts where nothing is."""

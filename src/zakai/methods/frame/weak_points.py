@@ -25,7 +25,9 @@ from zakai.numerics.trains.carried import Carried, Path, Term
 SPACING = 1.3
 MOST_NODES = 81
 MOST_STEPS = 8  # of Runge-Kutta along a kick
-CORRELATED = 0.02  # correlation of the noise of a closed axis with that of another state, which is left out
+# Covariance of the noise of a closed axis with that of another state that is left out, in deviations of both and tolerances of a
+# build: a change of the covariance by so much moves the mean after an observation by about as much.
+LEFT_OUT = 0.5
 
 
 @dataclass
@@ -87,16 +89,22 @@ def _nodes(square: float, reach: float, t: float) -> tuple[Array, Array]:
     return nodes, weights / weights.sum()
 
 
-def along_closed_axes(Q: Array, closed: Array) -> tuple[list[Array], Array]:
+def along_closed_axes(Q: Array, scale: Array, closed: Array, tolerance: float) -> tuple[list[Array], Array]:
     """Return the directions (n,) of noise of closed axes together with other states, and the noise (n, n) without them.
 
     The noise of a closed axis j is a normal number times Q_j / root Q_jj, and independent noise of the other states.
+
+    Args:
+        Q: the noise (n, n).
+        scale: standard deviations of the states (n,).
+        closed: which axes are closed (n,).
+        tolerance: of the build.
     """
     found = list[Array]()
     for j in np.flatnonzero(closed):
-        scale = np.sqrt(np.maximum(np.diag(Q), 1e-300))
-        if np.abs(np.delete(Q[j] / scale / scale[j], j)).max() > CORRELATED:
-            found.append(Q[j] / scale[j])
+        shared = np.abs(np.delete(Q[j] / scale / scale[j], j))
+        if shared.max(initial=0.0) > LEFT_OUT * tolerance:
+            found.append(Q[j] / math.sqrt(Q[j, j]))
             Q = Q - np.outer(found[-1], found[-1])
             Q[j] = Q[:, j] = 0.0
     return found, Q

@@ -7,7 +7,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zakai.numerics.trains.kernels import values_at
+from zakai.numerics.particles.formulas import evaluate
+from zakai.numerics.trains.kernels import add_train, flow, weigh
 from zakai.numerics.trains.train import Train
 
 Array = Any
@@ -55,18 +56,22 @@ class Carried:
 
     def __call__(self, x: Array) -> Array:
         """Return the values (P,) at points x (n, P)."""
-        terms = [
-            (term.density.arrays, term.scale, term.program, self.box, (term.path.times, term.path.given)) for term in self.terms
-        ]
-        if len(terms) % 2:
-            terms.append((terms[0][0], np.zeros(2), *terms[0][2:]))
-        law, total = self.likelihood, np.zeros(x.shape[1])
-        arrays = law.program, law.given, law.counted, np.array([law.time, law.power, law.top])
-        x, out = np.ascontiguousarray(x), np.empty(x.shape[1])
-        for pair in zip(terms[::2], terms[1::2], strict=True):
-            values_at(pair, arrays, self.turn, x, out)
-            total += out
-        return total
+        x, out = np.ascontiguousarray(x), np.zeros(x.shape[1])
+        for term in self.terms:
+            if len(term.path.times):
+                ends = np.empty((len(x) + 1, x.shape[1]))
+                flow(term.program, self.box, (term.path.times, term.path.given), x, ends)
+                add_train(term.density.arrays, ends, True, term.scale, out)
+            else:
+                add_train(term.density.arrays, x, False, term.scale, out)
+        law, logs = self.likelihood, np.empty((0, len(out)))
+        used = law.counted > 0
+        if used.any():
+            logs = np.empty((len(used), len(out)))
+            evaluate(law.program, self.box, x, law.time, law.given, 0, len(out), logs)
+            logs = np.ascontiguousarray(logs[used])
+        weigh(logs, np.array([law.power, law.top]), self.box, self.turn, x, out)
+        return out
 
     def times(self, likelihood: Likelihood) -> Carried:
         """Return the same density times another likelihood."""

@@ -2,6 +2,9 @@
 
     v(x) = sum_j a_j u_j(phi_j(x)) exp(int c along phi_j)  *  p(z | x)^power / e^top
 
+by `flow`, `add_train`, `evaluate` of the likelihood, and `weigh`.  They are called one after the other: a kernel that called
+them would be compiled with all of them in it once more.
+
 A motion is a program of formulas (`numerics/particles/formulas.py`) whose first n outputs are the velocity and whose last is the
 rate c of the logarithm, with the ends of the domain; a path is a list of Runge-Kutta steps through known numbers.
 """
@@ -16,7 +19,7 @@ from numba import types
 
 from zakai.numerics.compiled import helper, kernel
 from zakai.numerics.formula_kernel import BLOCK
-from zakai.numerics.particles.formulas import BOX, F1, F2, F3, I1, PROGRAM, block_of, evaluate, load_point, run_program
+from zakai.numerics.particles.formulas import BOX, F1, F2, F3, I1, PROGRAM, block_of, load_point, run_program
 from zakai.numerics.trains.grid import PAD, taps
 
 Array = Any
@@ -28,17 +31,12 @@ PATH = types.Tuple((F2, F3))
 TRAIN = types.Tuple((F1, F2, F1, F1, I1, F1, I1, I1, F1, F1, F2, F1))
 # Ranks (n + 1,), sizes (n,), where each core begins (n,), and the cores in the order (N, a, b).
 PACKED = types.Tuple((I1, I1, I1, F1))
-# A train, [factor, logarithm of what it is divided by], the motion, the domain, and the path to it.
-TERM = types.Tuple((TRAIN, F1, PROGRAM, BOX, PATH))
-# The law, its given numbers, which terms count, and [time, power, top]; no term counts: no likelihood.
-LAW = types.Tuple((PROGRAM, F1, F1, F1))
 POINTS, TOGETHER = 1024, 64  # of a block, which are sorted, and of one product of matrices
 LARGEST_LOG = 500.0  # of a factor; the exponential of more is cut
 # Later observations lead into what are tails now, where an error relative to the density becomes one of the mean.  With the power
 # 1/2 of the sums (the scaling of correspondence analysis) the error of a skeleton is relative to the density, as an average over
 # its mass.  On fourteen wide tracks seen by bearings .4 had a quarter of the error of no scaling, for 1.15 times the evaluations.
-# Rows below the share `DEEPEST` of the largest count less, or ranks grow with what is noise.
-POWER, DEEPEST = 0.4, 0.01
+POWER = 0.4
 
 
 @kernel(types.void(PROGRAM, BOX, PATH, F2, F2))
@@ -161,57 +159,28 @@ def add_train(train: Any, x: Array, moved: bool, scale: Array, out: Array) -> No
                     out[first + p] += value
 
 
-@helper
-def _within(x: Array, p: int, turn: Array, box: Any) -> bool:
-    """Return whether point p is in the domain and on the turn of the angles about `turn` (n,), NaN for other states."""
-    for d in range(turn.size):
-        if abs(x[d, p] - turn[d]) > math.pi * (1.0 + 1e-6) or x[d, p] < box[0][d] or x[d, p] > box[1][d]:
-            return False
-    return True
-
-
-@kernel(types.void(types.Tuple((TERM, TERM)), LAW, F1, F2, F1))
-def values_at(terms: Any, law: Any, turn: Array, x: Array, out: Array) -> None:
-    """Write the values of a carried density times its likelihood at points x (n, P); zero outside of the domain.
+@kernel(types.void(F2, F1, BOX, F1, F2, F1))
+def weigh(logs: Array, numbers: Array, box: Any, turn: Array, x: Array, out: Array) -> None:
+    """Multiply values (P,) at points x (n, P) by a likelihood; zero outside of the domain.
 
     Args:
-        terms: densities with their paths; a factor of zero leaves one out, a path without steps takes it where it is.
-        law: the likelihood.
+        logs: the logarithms (m, P) of the factors of the likelihood, which may have none.
+        numbers: [power, top]: the power of the likelihood, and the logarithm of what divides it.
+        box: the domain.
         turn: the centre (n,) of the turn on which angles are taken, NaN for other states.
         x: the points.
-        out: receives the values (P,).
+        out: the values.
     """
-    n, count = x.shape
-    ends = np.empty((n + 1, count))
-    for p in range(count):
-        out[p] = 0.0
-    for term in terms:
-        train, scale, program, box, path = term
-        if scale[0] != 0.0:
-            if path[0].shape[0]:
-                flow(program, box, path, x, ends)
-                add_train(train, ends, True, scale, out)
-            else:
-                add_train(train, x, False, scale, out)
-    law_program, known, counted, numbers = law
-    domain = terms[0][3]
-    for p in range(count):
-        if not _within(x, p, turn, domain):
-            out[p] = 0.0
-    used = False
-    for k in range(counted.size):
-        used = used or counted[k] != 0.0
-    if used:
-        logs = np.empty((counted.size, count))
-        evaluate(law_program, domain, x, numbers[0], known, 0, count, logs)
-        for p in range(count):
-            if out[p] != 0.0:
-                total = 0.0
-                for k in range(counted.size):
-                    if counted[k] != 0.0:
-                        total += logs[k, p]
-                value = out[p] * math.exp(min(numbers[1] * total - numbers[2], LARGEST_LOG)) if total == total else 0.0
-                out[p] = value if value == value else 0.0
+    for p in range(x.shape[1]):
+        for d in range(x.shape[0]):
+            if abs(x[d, p] - turn[d]) > math.pi * (1.0 + 1e-6) or x[d, p] < box[0][d] or x[d, p] > box[1][d]:
+                out[p] = 0.0
+        if logs.shape[0] and out[p] != 0.0:
+            total = 0.0
+            for k in range(logs.shape[0]):
+                total += logs[k, p]
+            value = out[p] * math.exp(min(numbers[0] * total - numbers[1], LARGEST_LOG)) if total == total else 0.0
+            out[p] = value if value == value else 0.0
 
 
 @kernel(types.void(F2, F2, F2, F2))
@@ -228,17 +197,17 @@ def fibre_points(left: Array, axis: Array, right: Array, out: Array) -> None:
 
 
 @helper
-def _to_factors(sums: Array) -> None:
+def _to_factors(sums: Array, power: float, deepest: float) -> None:
     """Replace sums of rows or columns by the factors of these."""
     top = 0.0
     for p in range(sums.size):
         top = max(top, sums[p])
     for p in range(sums.size):
-        sums[p] = max(sums[p] / top, DEEPEST) ** -POWER if top > 0.0 else 1.0
+        sums[p] = max(sums[p] / top, deepest) ** -power if top > 0.0 else 1.0
 
 
-@kernel(types.int64(F2, types.float64, types.int64, I1, I1, F2), reordered=True)
-def skeleton(A: Array, tolerance: float, most: int, rows: Array, columns: Array, out: Array) -> int:
+@kernel(types.int64(F2, types.float64, types.UniTuple(types.float64, 2), types.int64, I1, I1, F2), reordered=True)
+def skeleton(A: Array, tolerance: float, scaling: Any, most: int, rows: Array, columns: Array, out: Array) -> int:
     """Write rows of A (m, b) whose span interpolates it, and return their number r.
 
     Pivoted Gram-Schmidt to a relative error in the Frobenius norm, then rows of nearly maximal volume, both for A with rows and
@@ -247,6 +216,7 @@ def skeleton(A: Array, tolerance: float, most: int, rows: Array, columns: Array,
     Args:
         A: the matrix.
         tolerance: the relative error.
+        deepest: the share of the largest sum below which rows and columns are not divided by less.
         most: the largest r.
         rows: receives the rows (r,).
         columns: receives the columns (r,) that were pivots.
@@ -260,8 +230,8 @@ def skeleton(A: Array, tolerance: float, most: int, rows: Array, columns: Array,
         for q in range(b):
             of_row[p] += abs(A[p, q])
             of_column[q] += abs(A[p, q])
-    _to_factors(of_row)
-    _to_factors(of_column)
+    _to_factors(of_row, scaling[0], scaling[1])
+    _to_factors(of_column, scaling[0], scaling[1])
     for q in range(b):
         norms[q] = 0.0
         for p in range(m):
