@@ -381,22 +381,13 @@ class Coupled(NamedTuple):
         return motion.advanced(self.coarse._replace(places=places), self.start, self.noise)
 
 
-def coupled(
-    motion: Motion, interval: Interval, values: Array, pilots: Pilots, count: int, paired: bool = False
-) -> Coupled:
-    """Return pilots after an interval by 2 `count` substeps, and what moves them by `count` with the same noise.
-
-    Where they are `paired`, the four quarters have equal starts, the noise of both signs, and that of both halves of each
-    substep in both orders.
-    """
+def coupled(motion: Motion, interval: Interval, values: Array, pilots: Pilots, count: int) -> Coupled:
+    """Return pilots after an interval by 2 `count` substeps, and what moves them by `count` with the same noise."""
     system, mean, scale = motion.system, pilots.mean, pilots.scale
     (coarse, slopes), (fine, _) = (motion.linearised(interval, Scheme(k, 4), values, mean, scale) for k in (count, 2 * count))
     noise, start = np.empty((fine.width, pilots.states.shape[1])), pilots.states
     normals(key_of(pilots.key), 0, noise.shape[1], noise)
-    if paired:
-        quarter = noise.shape[1] // 4
-        noise[:, quarter : 2 * quarter] = -noise[:, :quarter]
-    if paired or system.kind != ADDITIVE:
+    if system.kind != ADDITIVE:
         noise, start = _exchanged(fine, noise, start)
     shared = _coarse_noise(motion, coarse, fine, noise, 0.25 * (interval.stop - interval.start) / count * slopes)
     y, gained = motion.advanced(fine, start, noise)
