@@ -37,6 +37,8 @@ NOISE = 3e-15  # error of a density relative to its maximum, which matters in it
 KERNEL_SHARE = 2e-2  # of the promised error that the splitting of one interval may leave in `limited-direct`
 SHARE = 5e-3  # of the tolerance that the splitting of one interval may leave
 SHARED = 128  # points of the largest grid on which many steps share a decomposition
+ROUNDS = 2  # of cutting, after which what is not resolved is left to adaptive substeps
+_X = np.zeros(1)
 
 
 class State(NamedTuple):
@@ -397,21 +399,15 @@ def coefficients_of(prepared: Prepared, steady: CoefficientsInTime | None = None
     return CoefficientsInTime(drifts, outputs, covariances, precisions, constants, parts)
 
 
-_X = np.zeros(1)
-
-
 def _factors_alone(prepared: Prepared, steady: CoefficientsInTime) -> CoefficientsInTime:
     """Return the coefficients of one interval in which only the factors of f and h, which the nodes resolve, vary in time."""
     assert prepared.system.separated is not None
     start, stop = float(prepared.schedule.starts[0]), float(prepared.schedule.stops[0])
-    t = np.minimum(start + prepared.lengths[0] * _NODES, math.nextafter(stop, start))
+    t = np.minimum(start + prepared.lengths[0] * GAUSS_NODES[None], math.nextafter(stop, start))
     factors = prepared.system.separated[0](_X, t, prepared.theta)
     _, outputs, covariances, precisions, constants, _ = steady
-    parts = _RESOLVED if np.isfinite(factors).all() else _UNRESOLVED
+    parts = np.array([int(np.isfinite(factors).all())])
     return CoefficientsInTime(factors, factors[:, : outputs.shape[1]], covariances, precisions, constants, parts)
-
-
-_NODES, _RESOLVED, _UNRESOLVED = GAUSS_NODES[None], np.ones(1, int), np.zeros(1, int)
 
 
 def _mixed_terms(prepared: Prepared, t: np.ndarray) -> np.ndarray:
@@ -466,9 +462,6 @@ def steps_of(prepared: Prepared) -> Steps:
     lengths = np.ascontiguousarray(prepared.lengths)
     shares = np.ones(len(kinds)) if prepared.shares is None else prepared.shares
     return Steps(kinds, lengths, shares, precisions, c.constants, parameters, c.drifts, c.outputs, c.covariances)
-
-
-ROUNDS = 2  # of cutting, after which what is not resolved is left to adaptive substeps
 
 
 def parts_of(prepared: Prepared) -> Parts | None:
