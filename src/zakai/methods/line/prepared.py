@@ -7,7 +7,6 @@ was gathered over more than the interval, belongs to the last part.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
@@ -32,7 +31,6 @@ from zakai.numerics.line.steps import FACTOR, KERNEL, SPLIT, SPLIT_FACTOR, Limit
 from zakai.records.schedule import Schedule, lengths_of
 
 T = TypeVar("T")
-
 NOISE = 3e-15  # error of a density relative to its maximum, which matters in its tails
 KERNEL_SHARE = 2e-2  # of the promised error that the splitting of one interval may leave in `limited-direct`
 SHARE = 5e-3  # of the tolerance that the splitting of one interval may leave
@@ -402,12 +400,11 @@ def coefficients_of(prepared: Prepared, steady: CoefficientsInTime | None = None
 def _factors_alone(prepared: Prepared, steady: CoefficientsInTime) -> CoefficientsInTime:
     """Return the coefficients of one interval in which only the factors of f and h, which the nodes resolve, vary in time."""
     assert prepared.system.separated is not None
-    start, stop = float(prepared.schedule.starts[0]), float(prepared.schedule.stops[0])
-    t = np.minimum(start + prepared.lengths[0] * GAUSS_NODES[None], math.nextafter(stop, start))
+    start, stop = prepared.schedule.starts[0], prepared.schedule.stops[0]
+    t = np.minimum(start + prepared.lengths[0] * GAUSS_NODES[None], np.nextafter(stop, start))
     factors = prepared.system.separated[0](_X, t, prepared.theta)
-    _, outputs, covariances, precisions, constants, _ = steady
     parts = np.array([int(np.isfinite(factors).all())])
-    return CoefficientsInTime(factors, factors[:, : outputs.shape[1]], covariances, precisions, constants, parts)
+    return steady._replace(drifts=factors, outputs=factors[:, : steady.outputs.shape[1]], parts=parts)
 
 
 def _mixed_terms(prepared: Prepared, t: np.ndarray) -> np.ndarray:
