@@ -82,3 +82,12 @@ def test_fields_that_do_not_commute_are_guided_to_a_precise_observation():
     assert np.nansum(result.health["guided"]) == 8
     assert np.nansum(result.health["tempering_levels"]) == 0
     assert np.nanmin(result.health["effective_sample_size"]) > 300
+
+
+def test_noise_that_decays_within_an_interval_is_not_lost_in_the_first_one():
+    model = zakai.Model(
+        state=["x"], drift=["-100*x - x**3"], observation=["x"], observation_kind="samples", observation_noise=[[100.0]],
+        prior={"kind": "gaussian", "mean": [0], "cov": [[0.01]]},
+    )  # fmt: skip
+    result = zakai.filter(model, zakai.Record([0.9], [0.0], "samples"), "guided-particles")
+    assert result.variance[1, 0] == pytest.approx(1 / 200, rel=0.2)  # stationary

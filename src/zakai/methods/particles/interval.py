@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
@@ -24,6 +25,7 @@ PILOTS = 128  # particles by which the time step is measured
 # standard error of a mean where that is more, up to a largest one.
 TIME_ERROR, OF_RANDOM_ERROR, MOST_TIME_ERROR = 0.005, 0.1, 0.1
 MOST_SUBSTEPS = 64
+DECAYED = 4.0  # times e that a deviation may shrink within one of the substeps that are tried first
 LEAST_CONTRACTION = 0.02  # ratio of deviations at the end and the start of an interval, below which errors are not judged by it
 # Measured: a line of a formula, and a coordinate in an evaluation of a flow, take 0.6 ns, a normal number 4 ns, and all that is
 # done with a particle after an interval 60 ns.
@@ -141,6 +143,12 @@ class Motion:
         given = self.given_numbers(interval, np.array([[interval.start, interval.stop]]), values)
         A = self.matrix(mean, scale, interval.start, given[0, 0])
         return float(np.linalg.norm(A * scale / scale[:, None]))
+
+    def decay(self, interval: Interval, values: Array, mean: Array, scale: Array) -> float:
+        """Return the rate at which a direction decays fastest at a mean (n,) at the start of an interval, or zero."""
+        given = self.given_numbers(interval, np.array([[interval.start, interval.stop]]), values)
+        A = self.matrix(mean, scale, interval.start, given[0, 0])
+        return max(0.0, -float(np.linalg.eigvals(A).real.min())) if np.isfinite(A).all() else 0.0
 
     def events(self, interval: Interval, scheme: Scheme, values: Array, mean: Array, scale: Array) -> Events:
         """Return the events of an interval in equal substeps.
@@ -317,7 +325,10 @@ def steps_of(motion: Motion, interval: Interval, values: Array, pilots: Pilots, 
         size = 0.5 * float(np.abs(motion.constant_matrix).sum(axis=1).max()) * (interval.stop - interval.start)
         if size**5 / 60 <= EXACT:
             return Steps(Scheme(1, 4), np.zeros(system.n), size**5 / 60, size**5 / 60)
-    count, found = max(1, guess), Steps(Scheme(max(1, guess), 4), np.full(system.n, np.nan), np.inf, np.inf)
+    # Where the noise of a whole substep decays, s and 2 s substeps agree that there is none.
+    decays = motion.decay(interval, values, pilots.mean, pilots.scale) * (interval.stop - interval.start)
+    count = max(1, guess, math.ceil(min(decays / DECAYED, MOST_SUBSTEPS)))
+    found = Steps(Scheme(count, 4), np.full(system.n, np.nan), np.inf, np.inf)
     for turn in range(4):
         errors = _time_errors(motion, interval, values, pilots._replace(key=pilots.key + turn), count)
         # The flow is of a higher order than the noise: fewer substeps than half of what was measured may have any error.
