@@ -150,3 +150,23 @@ def test_priors_have_the_moments_and_densities_of_their_draws():
     np.testing.assert_allclose(draws.var(axis=0), mixture.cov[0], rtol=0.04)
     grid = np.linspace(-9, 9, 4001)[:, None]
     assert np.exp(mixture.log_density(grid)).sum() * (grid[1, 0] - grid[0, 0]) == pytest.approx(1.0, abs=1e-10)
+
+
+@pytest.mark.parametrize(
+    ("drift", "start", "deviations"),
+    [
+        (["v", "-100*x - 0.2*v"], [0.1, 0.0], [0.158, 1.58]),  # Euler's ten steps of an interval made it grow to 1e17
+        (["v", "50*(1 - x**2)*v - x"], [2.0, 0.0], None),  # overflowed
+    ],
+)
+def test_steps_are_short_enough_for_a_drift_that_is_stiff_or_oscillates(drift, start, deviations):
+    model = zakai.Model(
+        state=["x", "v"], drift=drift, diffusion=[[0], [1]], observation=["x"], observation_kind="samples",
+        prior={"kind": "gaussian", "mean": start, "cov": [0.01, 0.01]},
+    )  # fmt: skip
+    times = np.arange(1, 201) * 0.5
+    truth, record = zakai.simulate(model, times, seed=3)
+    again, _ = zakai.simulate(model, times, seed=3)
+    assert (again.values == truth.values).all() and np.abs(truth.values[:, 0]).max() < 3.0
+    if deviations is not None:  # the stationary ones: 1 / (2 * 0.2) for v, and a hundredth of it for x
+        assert truth.values.std(axis=0) == pytest.approx(deviations, rel=0.25)

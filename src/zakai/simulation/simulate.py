@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -19,11 +19,10 @@ from zakai.records import Inputs, Record, Truth
 from zakai.records.inputs import check_inputs
 from zakai.simulation.density_draw import draw_from_density
 from zakai.simulation.stepper import Stepper, outside_domain
+from zakai.simulation.substeps import finer_counts, usual_counts
 
-SUBSTEPS = 10
-SUBSTEPS_OF_STATE_DEPENDENT_NOISE = 50
-MOST_SUBSTEPS = 1000
 CHUNK = 100_000  # substeps held in memory at once
+ATTEMPTS = 4  # at a path whose steps are too long
 
 
 def simulate(
@@ -51,7 +50,8 @@ def simulate(
         initial: the state (n,) at the start; by default it is drawn from the prior.
         substeps: Euler steps in each interval. By default 10 in an interval of at most the median length, and proportionally
             more in a longer one, at most 1,000; 50 where the diffusion depends on the state, with Milstein's correction where
-            the noises commute.
+            the noises commute. Where they are too long for the drift along the path (it is stiff, or an oscillation would grow),
+            the path is drawn again with more, and f d is the change without noise by the method of Runge and Kutta.
         inputs: the known inputs of the model; a step begins where they jump.
 
     Returns:
@@ -70,7 +70,7 @@ def simulate(
         return _with_path(model, times, seed, initial, substeps, inputs)
     grid = _checked_times(model, times)
     check_inputs(model, inputs, float(grid[1]), float(grid[-1]))
-    counts = _substeps(np.diff(grid), substeps, model)
+    counts = _counts(np.diff(grid), substeps, model)
     checks.check_noise_at(model, grid)
     try:
         rng = np.random.default_rng(seed)
@@ -78,12 +78,7 @@ def simulate(
         raise InputError(f"seed: expected a whole number of at least 0, got {kind_of(seed)}") from None
     state = _initial_state(model, initial, rng)
     path = _Path(model, rng, inputs)
-    states, rows = [state], []
-    for first, last in _chunks(counts):
-        inner, observed = path.advance(state, grid[first : last + 1], counts[first:last])
-        state = inner[-1]
-        states.extend(inner)
-        rows.append(observed)
+    states, rows = path.whole(state, grid, counts, fixed=substeps is not None)
     values = np.array(states)
     for column, name in enumerate(model.state):
         if name in model.periodic:
@@ -111,7 +106,9 @@ class _Path:
     def __init__(self, model: Model, rng: np.random.Generator, inputs: Inputs | None):
         self.model, self.inputs = model, inputs
         # Streams of their own, so that the path does not depend on what is observed, nor either on the chunks.
-        self._state_rng, self._observation_rng, bridge_rng = rng.spawn(3)
+        self._generators = rng.spawn(3)
+        self._state_rng, self._observation_rng, bridge_rng = self._generators
+        self._steep = False  # whether steps of Runge and Kutta are taken
         self._theta = model.theta()
         self._drift = program_of(list(model.drift), model, stable=True).scalar(self._theta.tolist())
         self._stepper = None
@@ -125,6 +122,32 @@ class _Path:
         """The matrix at all times, (N, ., .), or at one, (., .), if it does not depend on time."""
         t = times if getattr(self.model, key).has(self.model.t) else times[0]
         return self._coefficients[key](np.zeros(self.model.n), t, self._theta)
+
+    def whole(
+        self, state: np.ndarray, grid: np.ndarray, counts: np.ndarray, fixed: bool
+    ) -> tuple[list[np.ndarray], list[np.ndarray]]:
+        """The states (K + 1) and the observations, in parts; with more steps where they are too long, unless they are `fixed`."""
+        generators = [own.bit_generator.state for own in self._generators]
+        for attempt in range(ATTEMPTS):
+            states, rows, fault = [state], list[np.ndarray](), None
+            try:
+                for first, last in _chunks(counts):
+                    inner, observed = self.advance(states[-1], grid[first : last + 1], counts[first:last])
+                    states.extend(inner)
+                    rows.append(observed)
+            except InputError as wrong:
+                fault = wrong
+            finer = None
+            if not fixed and attempt + 1 < ATTEMPTS:
+                finer = finer_counts(self.model, grid, np.array(states), counts, self.inputs)
+            if finer is None or (self._steep and (finer == counts).all()):
+                break
+            counts, self._steep = finer, True
+            for own, known in zip(self._generators, generators, strict=True):
+                own.bit_generator.state = known
+        if fault is not None:
+            raise fault
+        return states, rows
 
     def advance(self, state: np.ndarray, grid: np.ndarray, counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The states at the ends of the intervals, (K, n), and the increments or samples there, (K, m)."""
@@ -174,12 +197,12 @@ class _Path:
         self, state: np.ndarray, times: np.ndarray, steps: np.ndarray, noise: np.ndarray, u: np.ndarray | None
     ) -> np.ndarray:
         """The states at every substep, (N+1, n); plain floats are faster than arrays of a few numbers."""
-        drift, x = self._drift, state.tolist()
+        drift, x = self._fourth_order if self._steep else self._of_euler, state.tolist()
         fine = [x]
         try:
             inputs = [()] * len(times) if u is None else u.tolist()
             for t, step, shock, own in zip(times.tolist(), steps.tolist(), noise.tolist(), inputs):
-                x = [xi + fi * step + wi for xi, fi, wi in zip(x, drift(x, t, own), shock)]
+                x = [xi + fi * step + wi for xi, fi, wi in zip(x, drift(x, t, own, step), shock)]
                 fine.append(x)
         except (ValueError, ArithmeticError):  # no such number, or too large a one; said below
             fine.append([float("nan")] * len(x))
@@ -190,6 +213,17 @@ class _Path:
             own = None if u is None else u[last]
             self._refuse("drift", result[last], times[last], "the state grows beyond double precision", own)
         return result
+
+    def _of_euler(self, x: Sequence[float], t: float, own: Sequence[float], step: float) -> Sequence[float]:
+        return self._drift(x, t, own)
+
+    def _fourth_order(self, x: Sequence[float], t: float, own: Sequence[float], step: float) -> Sequence[float]:
+        """The mean drift over a step without noise, by the method of Runge and Kutta."""
+        a = self._drift(x, t, own)
+        b = self._drift([xi + 0.5 * step * ai for xi, ai in zip(x, a)], t + 0.5 * step, own)
+        c = self._drift([xi + 0.5 * step * bi for xi, bi in zip(x, b)], t + 0.5 * step, own)
+        d = self._drift([xi + step * ci for xi, ci in zip(x, c)], t + step, own)
+        return [(ai + 2.0 * bi + 2.0 * ci + di) / 6.0 for ai, bi, ci, di in zip(a, b, c, d)]
 
     def _observe(self, x: np.ndarray, t: np.ndarray, u: np.ndarray | None) -> np.ndarray:
         values = self._observation(x, t, self._theta, u)
@@ -233,11 +267,9 @@ def _checked_times(model: Model, times: Any) -> np.ndarray:
     return grid
 
 
-def _substeps(intervals: np.ndarray, substeps: Any, model: Model) -> np.ndarray:
+def _counts(intervals: np.ndarray, substeps: Any, model: Model) -> np.ndarray:
     if substeps is None:
-        least = SUBSTEPS_OF_STATE_DEPENDENT_NOISE if checks.depends_on_state(model.diffusion, model) else SUBSTEPS
-        relative = intervals / np.median(intervals[intervals > 0]) if (intervals > 0).any() else intervals
-        return np.clip(np.ceil(least * relative * (1 - 1e-9)), least, MOST_SUBSTEPS).astype(int)
+        return usual_counts(intervals, model)
     if isinstance(substeps, bool) or not isinstance(substeps, int | np.integer) or substeps < 1:
         raise InputError(f"substeps: expected a whole number of at least 1, got {kind_of(substeps)}")
     return np.full(len(intervals), int(substeps))
