@@ -16,7 +16,7 @@ from zakai.numerics.arrays import Array
 from zakai.records import Inputs
 
 SUBSTEPS, SUBSTEPS_OF_STATE_DEPENDENT_NOISE, MOST = 10, 50, 1000  # of an interval of median length, and of one at most
-STEEP, GROWTH = 0.5, 0.25  # |l| d, and the growth that Euler's method adds, from which other steps are taken
+STEEP, GROWTH = 0.5, 1.0  # |l| d, and the growth that Euler's method adds, from which other steps are taken
 FINE, MOST_FINE = 0.2, 20_000  # |l| d of those steps, and the most of them in an interval
 LOOKED_AT = 500  # states of a path at which the drift is differentiated
 _STEP = 1e-6  # of the differences, relative to a state
@@ -54,12 +54,12 @@ def finer_counts(model: Model, grid: Array, states: Array, counts: Array, inputs
         J = J[np.isfinite(J).all(axis=(1, 2))]
         if not len(J):
             return None
-        rates = np.linalg.eigvals(J).ravel()
+        rates = np.linalg.eigvals(J)
         length = np.diff(grid)
         step = float(np.max(length / counts))
         grows = np.log(np.abs(1.0 + rates * step)) / step - rates.real
         horizon = 1.0 / np.maximum(np.abs(rates.real), 1.0 / max(float(grid[-1] - grid[0]), 1e-300))
-    fastest = float(np.abs(rates).max())
-    if fastest * step <= STEEP and float(np.max(np.where(rates.imag != 0, grows * horizon, 0.0))) <= GROWTH:
+    fastest, growth = float(np.abs(rates).max()), np.where(rates.imag != 0, grows * horizon, 0.0).max(axis=1)
+    if fastest * step <= STEEP and float(np.mean(growth)) <= GROWTH:
         return None
     return np.clip(np.ceil(length * fastest / FINE), counts, MOST_FINE).astype(int)
