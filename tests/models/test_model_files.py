@@ -104,6 +104,7 @@ FAULTS = [
     ("prior", f"{{{MIXTURE}, weights = [1]}}", "means: expected 1 lists of 2 numbers"),
     ("prior", '{kind = "density", log_density = "-x**2 - t"}', "log_density: column 9: unknown name 't'"),
     ("drfit", "[]", "unknown key 'drfit'; did you mean 'drift'"),
+    ("obs_noise", "[]", "unknown key 'obs_noise'; did you mean 'observation_noise'"),
     ("_source", '"x"', "unknown key"),
     ("self", "1", "unknown key"),
 ]

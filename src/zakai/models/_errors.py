@@ -31,7 +31,11 @@ def echo(value: object, length: int = 20) -> str:
 
 def did_you_mean(word: str, options: Iterable[str]) -> str:
     """`; did you mean 'drift'?`, or nothing when no option is close."""
-    close = get_close_matches(word[:64], list(options), n=1, cutoff=0.6)
+    known, parts = list(options), word[:64].split("_")
+    close = get_close_matches(word[:64], known, n=1, cutoff=0.6)
+    if min(map(len, parts)) >= 3:  # obs_noise is short for observation_noise
+        alike = [one for one in known if one.count("_") == len(parts) - 1]
+        close = [one for one in alike if all(map(str.startswith, one.split("_"), parts))] or close
     return f"; did you mean {close[0]!r}?" if close else ""
 
 
