@@ -121,3 +121,14 @@ def test_normal_numbers_have_the_normal_distribution():
     other = np.empty_like(numbers)
     normals(key_of(7, 2), 0, 30_000, other)
     assert np.abs(np.corrcoef(numbers[0], other[0])[0, 1]) < 0.03
+
+
+def test_a_reflecting_end_of_one_of_two_states_is_kept():
+    model = zakai.Model(
+        state=["l", "q"], drift=["q - 0.3", "-q"], diffusion=[[0.4, 0], [0, 0.3]], observation=["l"], observation_kind="samples",
+        observation_noise=[[100.0]], domain={"l": {"lower": 0, "upper": 1, "boundary": "reflecting"}},
+        prior={"kind": "gaussian", "mean": [0.5, 0], "cov": [0.01, 0.1]},
+    )  # fmt: skip
+    result = zakai.filter(model, zakai.Record([2.0], [0.3], "samples"), "guided-particles")
+    points = result.density(-1).points[:, 0]
+    assert result.warnings == [] and points.min() >= 0.0 and points.max() <= 1.0

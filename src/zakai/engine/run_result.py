@@ -61,7 +61,7 @@ def result_of_run(run: Run, why: str, considered: Mapping[str, tuple[Condition, 
         return run.complete(result)
     record = record_along(run.record, schedule)
     undefined = notes_on_formulas(noted, theta, record, result.mean, result.variance)
-    undefined += notes_on_domain(noted, theta, record, result.mean, result.variance)
+    undefined += notes_on_domain(noted, theta, record, result, method.reflects)
     undefined += notes_on_escape(method.name, noted, schedule, theta, result.mean, result.cov)
     lengths = notes_on_lengths(schedule, distances)
     misfit = notes_on_law(noted, theta, schedule, run.values, infos)

@@ -209,6 +209,8 @@ class Method(Generic[P, S]):
 
     `random` says that the numbers have random errors, which the standard errors of an Info report.
 
+    `reflects` says that states of a system with several are mirrored at reflecting ends.
+
     `by_values` says that a fit takes quadratics through values of the log-likelihood, which has no derivative but small jumps; it
     makes the option `choices` that the values of one quadratic have in common, so that the jumps are smaller, for a tolerance
     that is as many times larger as its argument says.
@@ -258,6 +260,7 @@ class Method(Generic[P, S]):
     shorter: str = "give fewer observations"
     absolute: bool = False
     random: bool = False
+    reflects: bool = False
     by_values: Callable[[float], Any] | None = None
     variant: Callable[[Model, Mapping[str, Any]], Method[Any, Any]] | None = None
     valid: Callable[[P, S], bool] | None = None

@@ -103,16 +103,19 @@ def notes_on_tables(model: Model, theta: np.ndarray, record: Record) -> list[str
     return notes
 
 
-def notes_on_domain(model: Model, theta: np.ndarray, record: Record, mean: np.ndarray, variance: np.ndarray) -> list[str]:
-    """Return a sentence for every end of a domain that several states may cross: only with one state an end is kept.
+def notes_on_domain(model: Model, theta: np.ndarray, record: Record, result: Any, reflects: bool) -> list[str]:
+    """Return a sentence for every end of a domain that several states may cross, unless the method `reflects` them there.
 
     They cross an end near which there is mass where the noise of that coordinate does not vanish, or its drift leads outwards.
     """
     notes: list[str] = []
     if model.n == 1 or not model.domain:
         return notes
+    mean, variance = np.asarray(result.mean), np.asarray(result.variance)
     evaluate = kept(model, notes_on_domain, lambda: numpy_function([*model.drift, *model.covariance.diagonal()], model))
     for name, interval in model.domain.items():
+        if reflects and interval.reflecting:
+            continue
         i = model.state.index(name)
         for end, side in ((interval.lower, 1.0), (interval.upper, -1.0)):
             if not np.isfinite(end):

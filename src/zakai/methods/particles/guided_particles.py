@@ -131,6 +131,7 @@ METHOD: Method[Prepared, State] = Method(
     bounds=BOUNDS,
     differentiable=False,
     random=True,
+    reflects=True,
     valid=valid,
     backward=BACKWARD,
     reduced=reduced,
