@@ -119,7 +119,7 @@ def size_of(state: object) -> int:
         return state.nbytes
     if isinstance(state, tuple | list):
         return sum(map(size_of, state))
-    return size_of(state.parts) if isinstance(state, Joined) else getattr(state, "nbytes", 8)
+    return size_of(state.parts) if isinstance(state, Joined) else 8
 
 
 class Run:
