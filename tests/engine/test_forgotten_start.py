@@ -1,9 +1,12 @@
 """A first interval a thousand times as long as the others is a start that was forgotten."""
 
+import logging
+
 import numpy as np
 import pytest
 
 import zakai
+from zakai.engine import batch
 
 UNIX = 1_634_800_000.0
 
@@ -71,3 +74,11 @@ def test_messages_print_times_so_that_they_differ():
 def test_a_forecast_far_ahead_has_no_start():
     result = zakai.filter(model_of(), record_of(1.0))
     assert not said(result.forecast([5000.0, 5001.0]).warnings)
+
+
+def test_a_long_run_whose_start_was_forgotten_says_so_while_it_runs(monkeypatch, caplog):
+    for name, value in (("FIRST", 0.0), ("EARLY", 0.0), ("LONG", 0.0), ("SURE", 0.0)):
+        monkeypatch.setattr(batch, name, value)
+    with caplog.at_level(logging.WARNING, "zakai"):
+        zakai.filter(model_of(), record_of(UNIX, count=200))
+    assert any("give a start next to the first time" in one.getMessage() for one in caplog.records)

@@ -402,3 +402,15 @@ def test_inputs_of_a_forecast_may_have_dates():
     plain = zakai.filter(model, zakai.Record([0.0, 1.0], [0.1, 0.2], "samples", zakai.Inputs([0.0, 1.0], [0.3, 0.3])))
     expected = plain.forecast([3.0], zakai.Inputs([2.0], [2.0])).mean
     np.testing.assert_array_equal(zakai.filter(model, record).forecast(ahead, later).mean, expected)
+
+
+def test_inputs_that_end_long_before_the_record_are_noted():
+    times = 0.1 * np.arange(1, 41)
+    hours = zakai.Inputs(np.arange(0, 41) / 600.0, np.zeros(41))  # in another unit of time
+    record = zakai.Record(times, np.zeros(40), "samples", inputs=hours)
+    (note,) = zakai.filter(driven("zero"), record).warnings
+    assert "the inputs u end at t = 0.0666666666667, and their last values are held up to 4" in note
+    switched = zakai.Inputs([0.0, 0.3, 0.4], [0.0, 1.0, 0.5])
+    seldom = zakai.Inputs([0.0, 2.0, 3.0], [0.0, 1.0, 0.5])
+    assert zakai.filter(driven("zero"), record, inputs=seldom).warnings == []
+    assert len(zakai.filter(driven("zero"), record, inputs=switched).warnings) == 1

@@ -14,6 +14,7 @@ from zakai import _registry
 from zakai._progress import FIRST, Progress, bar, within_announced
 from zakai.algebra.choice import faster
 from zakai.engine.loop import Run
+from zakai.notes.model import notes_on_start
 from zakai.numerics.compiled import working_time
 
 LONG = 10.0  # seconds of work that are announced
@@ -67,7 +68,10 @@ def _watched(
 
 
 def _advice(run: Run, each: float, left: float) -> str:
-    """Return what shortens a run of which an observation takes `each` seconds and the rest `left`."""
+    """Return what shortens a run of which an observation takes `each` seconds and the rest `left`; a forgotten start does."""
+    forgotten = notes_on_start(run.schedule)
+    if forgotten:
+        return forgotten[0]
     method, model = run.setting.method, run.setting.model
     other = faster(model, method.name, each) if left > MINUTE else None
     if other is None or other in method.shorter:

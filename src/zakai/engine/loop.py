@@ -19,6 +19,7 @@ from zakai.methods.system.escape import EscapeError
 from zakai.notes.health import warnings_of_run
 from zakai.notes.model import (
     notes_on_angles,
+    notes_on_inputs,
     notes_on_start,
     notes_on_tables,
     why_not_finite,
@@ -140,6 +141,7 @@ class Run:
                 *_after_gaps(self.schedule),
                 *notes_on_noise(*self.noted),
                 *notes_on_angles(setting.model, record),
+                *notes_on_inputs(setting.model, record.inputs, float(record.times[-1])),
                 *notes_on_tables(self.noted[0], setting.theta.real, record_along(record, self.noted[1])),
                 *self.empty.notes,
             ]

@@ -196,7 +196,7 @@ def _of_tolerance(result: Result, over: Array, distances: Callable[[], Array | N
     if not len(off):
         return []
     ratio = float(np.nanmax(np.where(over, result.health["tolerance_ratio"], -np.inf)))
-    figure = f"(tolerance_ratio exceeds 1 at {int(over.sum())} times, up to {ratio:.2g})"
+    figure = f"(the tolerance was missed at {_times(int(over.sum()))}, by up to {ratio:.2g} times: tolerance_ratio)"
     said, unknown = [], np.flatnonzero(errors >= UNKNOWN)
     end = int(unknown[0]) if len(unknown) else len(errors)
     advice = _COMPARE if len(result.state) < MANY else _PARTICLES
@@ -214,6 +214,10 @@ def _of_tolerance(result: Result, over: Array, distances: Callable[[], Array | N
             f"may mean nothing {figure}; {advice}"
         )
     return said
+
+
+def _times(count: int) -> str:
+    return "one time" if count == 1 else f"{count} times"
 
 
 def _words(name: str, bounds: Bounds) -> str:

@@ -19,6 +19,7 @@ from zakai.records.schedule import Schedule
 
 _KEYS = ("drift", "diffusion", "observation")
 FORGOTTEN = 1000.0  # ratio of the first interval to the longest other, which no schedule of observations has
+ENDED = 10.0  # longest distances of inputs after which a record that goes on has lost them
 _REACH, _TIMES = 3.0, 32  # deviations from the mean, and number of times, that are checked
 
 
@@ -74,6 +75,19 @@ def notes_on_start(schedule: Schedule) -> list[str]:
         f"the first interval, from the model's start {first:.12g} to the first time {last:.12g}, is "
         f"{lengths[0] / later:.2g} times as long as the longest other; unless it is meant, give a start next to the "
         f"first time, as start = {last - float(later):.12g}"
+    ]
+
+
+def notes_on_inputs(model: Model, inputs: Inputs | None, last: float) -> list[str]:
+    """Return a sentence where known inputs end long before the last time of the record, and their last values are held."""
+    if inputs is None or len(inputs) < 3:
+        return []
+    end = float(inputs.times[-1])
+    if not last - end > ENDED * float(np.diff(inputs.times).max()):
+        return []
+    return [
+        f"the inputs {', '.join(model.inputs)} end at t = {end:.12g}, and their last values are held up to {last:.12g}; unless "
+        f"it is meant, give them for all of the record, in its unit of time"
     ]
 
 
