@@ -16,7 +16,7 @@ References:
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -30,12 +30,19 @@ _KEEP = (1.0, 1.0, 0.0, 0.0, 0.0)  # power, change, no sweeps, rho, share of pla
 
 
 class Block(NamedTuple):
-    """The window with new noise in the last intervals, the noise of the new interval, the states after it, and log weights."""
+    """Noise that is drawn again in the last intervals and in the new one.
 
-    window: Window
-    noise: Array
+    So many `intervals` before the new one have new noise, `path` (D, N) is all of it, drawn from `gaussian` for the law `target`,
+    `particles` (n, N) are the states after it, `logs` (N,) the log weights, of which `earlier` (N,) is the part of the old noise.
+    """
+
+    intervals: int
+    target: Target
+    gaussian: Any
+    path: Array
     particles: Array
     logs: Array
+    earlier: Array
 
 
 def drawn_again(window: Window, weights: Array, target: Target, share: float, even: Even) -> Block | None:
@@ -56,7 +63,7 @@ def drawn_again(window: Window, weights: Array, target: Target, share: float, ev
         return None
     motion, rows = target.motion, slice(window.length - count, window.length)
     events, observed = window.events[rows], (window.times[rows], window.given[rows], window.counted[rows])
-    window, start, path = window.last(motion, count)
+    _, start, path = window.last(motion, count)
     past = Target(motion, joined(events), *observed, None, start)
     now = target.times, target.given, target.counted
     times, given, counted = (np.concatenate(pair) for pair in zip(observed, now, strict=True))
@@ -69,7 +76,10 @@ def drawn_again(window: Window, weights: Array, target: Target, share: float, ev
     particles, logs = whole.follow(new)
     _, _, old, _, _ = past.sweep(before, path, _KEEP, even.key)
     logs += ratio - old
-    lost = ~np.isfinite(particles).all(axis=0)
-    particles[:, lost] = start[:, lost]
-    logs[lost | np.isnan(logs)] = -np.inf
-    return Block(window.with_noise(count, new), np.ascontiguousarray(new[len(path) :]), particles, logs)
+    logs[~np.isfinite(particles).all(axis=0) | np.isnan(logs)] = -np.inf
+    return Block(count, whole, after, new, particles, logs, -old)
+
+
+def with_block(window: Window, target: Target, count: int, path: Array) -> Window:
+    """Return the past of the particles with other noise in its last intervals."""
+    return window.last(target.motion, count)[0].with_noise(count, path)

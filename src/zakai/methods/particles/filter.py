@@ -2,13 +2,10 @@
 
     x_i <- F(x_i, noise_i);   w_i <- w_i p(z | x_i);   resample where 1 / sum w^2 is below half of the particles
 
-A step whose plain weights leave few particles draws the noise again from the Gaussian posterior of the linearised interval, then
-of the last intervals, and where that fails too, carries plain particles to the posterior by powers of the likelihood with moves
-between them.  What is drawn depends on the seed, the number of the interval and the particle alone.
+What is drawn depends on the seed, the number of the interval and the particle alone.
 
 References:
     Gordon, Salmond and Smith 1993, Novel approach to nonlinear/non-Gaussian Bayesian state estimation.
-    Del Moral, Doucet and Jasra 2006, Sequential Monte Carlo samplers (powers of the likelihood).
     Gilks and Berzuini 2001, Following a moving target (moves of the past).
 """
 
@@ -17,13 +14,12 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from zakai.methods._protocol import Info
-from zakai.methods.particles.block import drawn_again
-from zakai.methods.particles.events import Events, Interval, Observed, with_update
+from zakai.methods.particles.events import Interval, Observed, with_update
 from zakai.methods.particles.interval import (
     MOST_SUBSTEPS,
     MOST_TIME_ERROR,
@@ -38,23 +34,17 @@ from zakai.methods.particles.interval import (
 from zakai.methods.particles.islands import CAUTION, FEW_ISLANDS, Islands, regression
 from zakai.methods.particles.moments import moments_of
 from zakai.methods.particles.programs import Array
-from zakai.methods.particles.state import Cloud, Control, Prepared, Rule, State
-from zakai.methods.particles.window import Target, Window, taken
+from zakai.methods.particles.proposals import TEMPER_BELOW, advanced
+from zakai.methods.particles.state import BEFORE_MOVES, MOVE, PILOT, PRIOR, RESAMPLING, Cloud, Control, Prepared, Rule, State
+from zakai.methods.particles.window import Window, taken
 from zakai.methods.system.escape_of_states import RARE, check_escape
-from zakai.numerics.particles.even import Even, even_normals
-from zakai.numerics.particles.population import effective, next_power, normalised, systematic
+from zakai.numerics.particles.even import even_normals
+from zakai.numerics.particles.population import effective, systematic
 from zakai.numerics.particles.random import uniform_number
 
-NOISE, RESAMPLING, PILOT, GUIDE, MOVE, PRIOR, LEVELS = range(7)  # uses of random numbers
 RESAMPLE_BELOW = 0.5  # effective share of the particles
-GUIDE_BELOW = 0.3  # effective share below which the noise is drawn again from the linearised posterior
 DOUBTFUL = 16  # resamplings after an interval that left few particles, in which standard errors are lower bounds
-TEMPER_BELOW, TEMPER_FLOOR = 0.1, 400  # effective share and number below which powers of the likelihood are taken
 HOPELESS = 0.01  # effective share of the particles below which their number is not raised
-GUIDE_SHARE, FIRST_SHARE = 0.1, 0.2  # of plain noise in draws from the linearised posterior, of an interval and of the prior
-FIRST_WIDER, FIRST_ROUNDS = 1.5, 6
-INFORMED = 0.25  # log det of the linearised posterior of the noise, below which the observation says nothing about the noise
-MOST_LEVELS = 60
 # The past is moved where that pays: by error^2 x time, with N variance of a mean, in variances of the state, as error^2.  What
 # ancestors add to that, beyond what the last move left, is taken away from later steps, and as the ancestors that are lost before
 # a move cannot come back, `MOVE_WORTH` times as much as has added up since the last one counts (error^2 x time of the turn is a
@@ -117,29 +107,6 @@ def reduced(state: State) -> State:
     return state._replace(window=window, islands=Islands.begin(0, len(state.islands.excess)))
 
 
-class Advanced(NamedTuple):
-    """Particles after an interval, with what was needed.
-
-    `weights` (N,) are those of the particles, `gained` is the increment of the log-likelihood, `noise` (D, N) that of the
-    interval, `predicted` (n',) the spread of the coordinates before the weights of the observation act, `deviations` (n,)
-    those of the states before it, `acceptance` that of moves between powers of the likelihood; the next one is the share of
-    the particles that left every bounded set, and `unseen` says that few particles are left by an observation that says
-    nothing of the noise.
-    """
-
-    cloud: Cloud
-    weights: Array
-    gained: float
-    noise: Array
-    predicted: Array
-    deviations: Array
-    levels: int = 0
-    guided: bool = False
-    acceptance: float = np.nan
-    lost: float = 0.0
-    unseen: bool = False
-
-
 def step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[State, Info]:
     """Advance by interval k of the schedule, then use what is observed at its stop."""
     try:
@@ -180,7 +147,7 @@ def _step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[Stat
         # Errors are measured in deviations after the observation, by how much the last one, or this one, has narrowed them.
         steps, control = substeps(prepared, interval, values, state, (before.mean, narrow * scale))
         events = with_update(motion.events(interval, steps.scheme, values, before.mean, scale), system, observed)
-        done = _advanced(prepared, start, events, observed, number, rank)
+        done = advanced(prepared, start, events, observed, number, rank)
         after = moments_of(system, done.cloud.particles, done.weights)
         found_narrow = _narrowing(after.cov, done.deviations)
         if last_turn or steps.error * narrow <= REPEATED * _allowed(control, len(weights)) * found_narrow:
@@ -334,127 +301,10 @@ def _observed(prepared: Prepared, interval: Interval, values: Array) -> Observed
     return Observed(t, row, np.array([float(len(late) > 0)]))
 
 
-def _advanced(
-    prepared: Prepared, cloud: Cloud, events: Events, observed: Observed, number: int, rank: Array
-) -> Advanced:
-    """Return the particles, with these numbers (N,) within their islands, after an interval and its observation."""
-    system, count = prepared.system, len(cloud.logs)
-    single = (np.array([observed.time]), observed.given[None], observed.counted[None])
-    target = Target(prepared.motion, events, *single, None, cloud.particles)
-    even = cloud.islands.even(prepared.key(number, NOISE), rank)
-    (noise, particles, seen, logs), lost = target.propagate(even, system.update is not None)
-    weights = np.exp(cloud.logs)
-    moved = moments_of(system, particles, weights)
-    before = moments_of(system, seen, weights) if len(seen) else moved
-    spreads = moved.spread, before.deviations
-    if system.sampled and not observed.counted.any() and not lost:
-        return Advanced(cloud._replace(particles=particles), weights, 0.0, noise, *spreads)
-    total = cloud.logs + logs
-    weights, top = normalised(total)
-    after = cloud._replace(particles=particles, logs=total - top)
-    plain = Advanced(after, weights, top, noise, *spreads, lost=lost / count)
-    if effective(weights) >= GUIDE_BELOW * count and np.isfinite(top):
-        return plain
-    moving = cloud.window.length == 0 and len(cloud.window.first) > 0
-    target = replace(target, prior=(cloud.window.mean, cloud.window.root) if moving else None)
-    first = np.concatenate([cloud.window.first, noise]) if moving else noise
-    gaussian = _linearised(target, cloud, plain)
-    if gaussian is not None and not moving and not np.isinf(top) and _uninformed(gaussian, 1.0):
-        return plain._replace(unseen=True)  # moves of noise of which the observation says nothing would be of no use
-    even = cloud.islands.even(prepared.key(number, GUIDE), rank)
-    best = (gaussian and _guided(target, cloud, plain, gaussian, even)) or Drawn(plain, first, logs, None)
-    size = effective(best.after.weights) if np.isfinite(best.after.gained) else 0.0
-    if size < TEMPER_BELOW * count and not moving:
-        block = drawn_again(cloud.window, np.exp(cloud.logs), target, GUIDE_SHARE, even)
-        found, gained = normalised(cloud.logs + block.logs) if block is not None else (weights, -np.inf)
-        if block is not None and np.isfinite(gained) and effective(found) > max(size, TEMPER_BELOW * count):
-            after = cloud._replace(particles=block.particles, logs=cloud.logs + block.logs - gained, window=block.window)
-            return plain._replace(cloud=after, weights=found, gained=gained, noise=block.noise, guided=True)
-    if size >= min(TEMPER_BELOW * count, TEMPER_FLOOR) or not np.isfinite(best.logs).any():
-        return best.after
-    return _tempered(prepared, target, cloud, best, number)
-
-
-class Drawn(NamedTuple):
-    """A draw of the noise of an interval, and the particles after it.
-
-    `path` (D, N) is the noise, with that of the prior where that is moved, `logs` (N,) the log weights, and `gaussian` that of
-    which it is drawn, none for plain noise.
-    """
-
-    after: Advanced
-    path: Array
-    logs: Array
-    gaussian: Any
-
-
 def _narrowing(cov: Array, before: Array) -> float:
     """Return the smallest ratio of the deviations of a state after and before the observation."""
     ratios = np.sqrt(np.maximum(np.diag(cov), 0.0)) / before
     return min(max(min((ratio for ratio in ratios.tolist() if ratio >= 0.0), default=1.0), NARROWEST), 1.0)
-
-
-def _linearised(target: Target, cloud: Cloud, plain: Advanced) -> Any:
-    """Return the linearised posterior of the noise, None where there is none."""
-    moving = target.prior is not None
-    begin = np.zeros(((len(cloud.window.first) if moving else 0) + len(plain.noise), 1))
-    wider, rounds = (FIRST_WIDER, FIRST_ROUNDS) if moving else (1.0, 2)
-    return target.gaussian(begin, np.exp(cloud.logs), rounds=rounds, wider=wider) if len(begin) else None
-
-
-def _uninformed(gaussian: Any, wider: float) -> bool:
-    return bool(np.log(gaussian[4] * np.sqrt(wider)).sum() < INFORMED)
-
-
-def _guided(target: Target, cloud: Cloud, plain: Advanced, gaussian: Any, even: Even) -> Drawn | None:
-    """Return the particles whose noise is drawn from the linearised posterior, None where that is no better."""
-    moving = target.prior is not None
-    d0 = len(cloud.window.first) if moving else 0
-    if _uninformed(gaussian, FIRST_WIDER if moving else 1.0):
-        return None
-    share = FIRST_SHARE if moving else GUIDE_SHARE
-    path, ratio = target.draw(gaussian, share, even)
-    particles, logs = target.follow(path)
-    logs = logs + ratio
-    lost = ~np.isfinite(particles).all(axis=0)
-    particles[:, lost] = plain.cloud.particles[:, lost]
-    logs[lost | np.isnan(logs)] = -np.inf
-    found, top = normalised(cloud.logs + logs)
-    if not np.isfinite(top) or np.isfinite(plain.gained) and effective(found) <= effective(plain.weights):
-        return None
-    window = cloud.window._replace(first=np.ascontiguousarray(path[:d0])) if moving else cloud.window
-    after = cloud._replace(particles=particles, logs=cloud.logs + logs - top, window=window)
-    done = plain._replace(cloud=after, weights=found, gained=top, noise=np.ascontiguousarray(path[d0:]), guided=True)
-    return Drawn(done, path, logs, gaussian)
-
-
-def _tempered(prepared: Prepared, target: Target, cloud: Cloud, drawn: Drawn, number: int) -> Advanced:
-    """Return particles carried from what they were drawn from to the posterior, by powers of their weights with moves between."""
-    count, moving, fixed = len(cloud.logs), target.prior is not None, drawn.gaussian
-    d0 = len(cloud.window.first) if moving else 0
-    path, logs, particles = drawn.path, drawn.logs, drawn.after.cloud.particles
-    gained, low, levels, rates = 0.0, 0.0, 0, list[float]()
-    share = 1.0 if fixed is None else FIRST_SHARE if moving else GUIDE_SHARE
-    control = (2.0, 20.0) if moving else (1.5, 12.0)
-    while low < 1.0 and levels < MOST_LEVELS:
-        high = next_power(cloud.logs, logs, 0.5 * count, low)
-        weights, top = normalised(cloud.logs + (high - low) * np.maximum(logs, -1e300))
-        gained, levels, low = gained + top, levels + 1, high
-        cloud, ancestors = cloud.resampled(weights, count, prepared.key(number, RESAMPLING, levels))
-        path = taken(path, ancestors)
-        target = replace(target, start=cloud.particles)
-        gaussian = target.gaussian(path, None, power=high) if fixed is None else fixed
-        if gaussian is None:
-            n, D = cloud.particles.shape[0], len(path)
-            gaussian = (np.zeros(D), np.zeros((D, n)), np.zeros(n), np.zeros((0, D)), np.zeros(0))
-        own = prepared.key(number, LEVELS, levels)
-        path, particles, logs, rate, _ = target.sweep(gaussian, path, (high, *control, 0.4, share), own)
-        rates.append(rate)
-    window = cloud.window._replace(first=np.ascontiguousarray(path[:d0])) if moving else cloud.window
-    after = cloud._replace(particles=particles, window=window)
-    noise, guided = np.ascontiguousarray(path[d0:]), fixed is not None
-    spreads, weights = (drawn.after.predicted, drawn.after.deviations), np.exp(cloud.logs)
-    return Advanced(after, weights, gained, noise, *spreads, levels, guided, float(np.mean(rates)), drawn.after.lost)
 
 
 def _loss(variance: Array, cov: Array, count: int) -> float:
@@ -473,7 +323,7 @@ def _moved(
     that a move gains too little: moves do not cross between modes.
     """
     before, count = cloud, len(weights)
-    cloud, _ = cloud.resampled(weights, count, prepared.key(number, RESAMPLING, MOST_LEVELS + 1))
+    cloud, _ = cloud.resampled(weights, count, prepared.key(number, RESAMPLING, BEFORE_MOVES))
     path, start = cloud.window.path()
     target = cloud.window.target(prepared.motion, start)
     gaussian = target.gaussian(path, None)

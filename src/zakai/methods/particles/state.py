@@ -20,6 +20,10 @@ from zakai.numerics.particles.population import systematic
 from zakai.numerics.particles.random import key_of, uniform_number
 from zakai.records.schedule import Schedule
 
+NOISE, RESAMPLING, PILOT, GUIDE, MOVE, PRIOR, LEVELS = range(7)  # uses of random numbers
+MOST_LEVELS = 60  # powers of the likelihood in an interval
+BEFORE_MOVES = MOST_LEVELS + 1  # the number of the resampling before moves of the past
+
 
 class Control(NamedTuple):
     """What decides the next step beside the particles.
