@@ -511,3 +511,27 @@ def test_the_number_of_particles_begins_high_and_changes_only_where_they_are_res
     assert count[-1] < 0.5 * count[0]
     changed = np.flatnonzero(count[1:] != count[:-1])
     assert len(changed) and np.all(size[changed] < 0.5 * count[changed])
+
+
+@pytest.mark.parametrize("outlier", [3.0, 5.0, 12.0])
+def test_an_outlier_that_the_noise_of_its_interval_does_not_explain_moves_the_past(outlier):
+    model = zakai.Model(
+        state=["p", "v", "b"], drift=["v", "-p - 0.4*v", "-b/10"], diffusion=[["0", "0"], ["0.5", "0"], ["0", "0.2"]],
+        observation=["p + b", "p"], observation_kind="samples", observation_noise=[["0.04", "0"], ["0", "0.04"]],
+        prior={"kind": "gaussian", "mean": [1, 0, 0], "cov": [0.1, 0.1, 0.1]},
+    )  # fmt: skip
+    _, record = zakai.simulate(model, 0.3 * np.arange(1, 13), seed=1)
+    values = record.values.copy()
+    values[6, 1] += outlier
+    record = zakai.Record(record.times, values, "samples")
+    result, exact = zakai.filter(model, record, PARTICLES), zakai.filter(model, record, "kalman-bucy")
+    # The weights of plain particles miss the evidence by 4 at 3, and by hundreds at 12.
+    assert abs(result.log_likelihood - exact.log_likelihood) < 4 * result.log_likelihood_standard_error < 1.5
+    assert (np.abs(result.mean - exact.mean)[1:] / np.sqrt(exact.variance[1:])).max() < 0.15
+
+
+def test_the_density_is_lost_where_one_particle_has_the_weight():
+    prior = {"kind": "mixture", "weights": [0.5, 0.5], "means": [[0.0, 0.0], [1.0, 0.0]], "covs": [[1.0, 1.0], [1.0, 1.0]]}
+    model = zakai.Model(**{**OSCILLATOR, "prior": prior}, observation=["x"], observation_kind="samples", observation_noise=[[0.04]])
+    result = zakai.filter(model, zakai.Record([0.01, 0.1, 0.2], [7.0, 7.0, 7.0], "samples"), PARTICLES)
+    assert result.warnings[0].startswith("the density was lost at t = 0.01") and "largest_weight" in result.warnings[0]

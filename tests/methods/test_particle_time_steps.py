@@ -91,3 +91,16 @@ def test_noise_that_decays_within_an_interval_is_not_lost_in_the_first_one():
     )  # fmt: skip
     result = zakai.filter(model, zakai.Record([0.9], [0.0], "samples"), "guided-particles")
     assert result.variance[1, 0] == pytest.approx(1 / 200, rel=0.2)  # stationary
+
+
+def test_the_noise_of_a_substep_in_which_an_input_jumps_has_the_rates_of_both_sides():
+    # The rate falls from 3 to 0.2 within the interval, of which one substep is one half.
+    model = zakai.Model(
+        state=["x", "y"], drift=["-q*x", "-q*(y - x)"], diffusion=[["1", "0"], ["0", "0.5"]], observation=["x"], inputs=["q"],
+        observation_kind="samples", observation_noise=[["0.2"]], prior={"kind": "gaussian", "mean": [0.0, 0.0], "cov": [1.0, 1.0]},
+    )  # fmt: skip
+    inputs = zakai.Inputs([0.0, 0.7, 1.3], [3.0, 0.2, 3.0])
+    record = zakai.Record([0.5, 1.0, 1.5], [np.nan, 2.0, np.nan], "samples", inputs=inputs)
+    result, exact = zakai.filter(model, record, PARTICLES, particles=20000), zakai.filter(model, record, "kalman-bucy")
+    assert np.abs(np.sqrt(result.variance / exact.variance)[1:] - 1.0).max() < 0.02
+    assert (np.abs(result.mean - exact.mean)[1:] / np.sqrt(exact.variance[1:])).max() < 0.03

@@ -113,6 +113,9 @@ BOUNDS = {
         6.0, "powers of the likelihood that one observation needed: it is far from what was predicted; check it and its noise, "
         "or give more frequent observations",
     ),
+    "largest_weight": (
+        0.5, "one particle has most of the weight: none is near the observation; check it and its noise, or name more particles",
+    ),
     "time_error": (0.1, "shift of a mean by the time step, in standard deviations; give more frequent observations"),
     "log_likelihood_error": (1.0, "standard error of the log-likelihood so far; name more particles before comparing models"),
 }  # fmt: skip
@@ -129,6 +132,7 @@ METHOD: Method[Prepared, State] = Method(
     density=density,
     state=State,
     bounds=BOUNDS,
+    losses={"largest_weight": 0.5},
     differentiable=False,
     random=True,
     reflects=True,

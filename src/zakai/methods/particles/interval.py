@@ -9,6 +9,7 @@ from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.linalg import expm
 
 from zakai.methods.particles.events import Events, Flows, Interval
 from zakai.methods.particles.programs import Array, Expressions
@@ -369,7 +370,9 @@ def _time_errors(
     def change(stages: int) -> tuple[float, Array, float]:
         x, gained = found.by(motion, stages)
         shift, largest = np.empty(system.n), np.empty(2)
-        errors = StepErrors(found.start, x, gained, found.finer, found.finer_gained, system.angles, pilots.scale)
+        errors = StepErrors(
+            found.start, x, gained, found.finer, found.finer_gained, system.angles, pilots.scale, found.variances
+        )
         step_errors(errors, LEAST_CONTRACTION, shift, largest)
         return 4 / 3 * float(largest[0]), 4 / 3 * shift, 4 / 3 * float(largest[1])
 
@@ -377,13 +380,17 @@ def _time_errors(
 
 
 class Coupled(NamedTuple):
-    """Pilots that twice as many substeps moved from `start` to `finer` (n, N), and the `coarse` events with the same `noise`."""
+    """Pilots that twice as many substeps moved from `start` to `finer` (n, N), and the `coarse` events with the same `noise`.
+
+    `variances` (n,) are by how much the noise of the coarse events has more variance at the end.
+    """
 
     start: Array
     finer: Array
     finer_gained: Array
     coarse: Events
     noise: Array
+    variances: Array
 
     def by(self, motion: Motion, stages: int) -> tuple[Array, Array]:
         """Return the ends (n, N) by the coarse events in so many stages, and the integrated log weights (N,)."""
@@ -400,9 +407,27 @@ def coupled(motion: Motion, interval: Interval, values: Array, pilots: Pilots, c
     normals(key_of(pilots.key), 0, noise.shape[1], noise)
     if system.kind != ADDITIVE:
         noise, start = _exchanged(fine, noise, start)
-    shared = _coarse_noise(motion, coarse, fine, noise, 0.25 * (interval.stop - interval.start) / count * slopes)
+    carried = 0.25 * (interval.stop - interval.start) / count * slopes
+    shared = _coarse_noise(motion, coarse, fine, noise, carried)
     y, gained = motion.advanced(fine, start, noise)
-    return Coupled(start, y, gained, coarse, shared)
+    variances = np.zeros(system.n)
+    if system.kind == ADDITIVE and not system.affine and fine.width and len(coarse.times) == count + 1:
+        variances = _more_variance(coarse.roots, fine.roots, carried)
+    return Coupled(start, y, gained, coarse, shared, variances)
+
+
+def _more_variance(coarse: Array, fine: Array, carried: Array) -> Array:
+    """Return by how much kicks of substeps (J, n, d) have more variance (n,) at the end than those of their halves (2 J, n, d).
+
+    `carried` (J, n, n) is df/dx times a quarter of a substep.  Pilots do not show it: the kicks of both are the same.
+    """
+    ahead, back = expm(carried), expm(-carried)
+    halves = ahead @ fine[::2], back @ fine[1::2]
+    apart = coarse @ coarse.transpose(0, 2, 1) - sum(half @ half.transpose(0, 2, 1) for half in halves)
+    total, half = np.zeros(apart.shape[1:]), ahead @ ahead
+    for own, flow in zip(apart, half, strict=True):
+        total = flow @ (flow @ total @ flow.T + own) @ flow.T
+    return total.diagonal().copy()
 
 
 def _exchanged(fine: Events, noise: Array, start: Array) -> tuple[Array, Array]:

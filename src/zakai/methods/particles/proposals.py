@@ -57,7 +57,7 @@ class Advanced(NamedTuple):
 class Drawn(NamedTuple):
     """A draw of noise, and the particles after it.
 
-    `path` (D, N) is the noise of an interval, with that of the prior where that is moved, or that of so many `intervals` before it;
+    `path` (D, N) is the noise of an interval, with that of the prior where that is moved, or of so many `intervals` before it;
     `logs` (N,) are the log weights, of which `earlier` (N,) does not depend on it, `target` its law, and `gaussian` that of which
     it is drawn, none for plain noise.
     """

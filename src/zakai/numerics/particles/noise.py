@@ -2,7 +2,8 @@
 
     Q = int exp(-s A) G exp(-s A') ds over (-d/2, d/2),      R R' = Q
 
-A is df/dx where the path of a state without noise is in the middle of the substep, of length d.
+A is df/dx where the path of a state without noise is in the middle of the substep, of length d.  Where an input jumps within it,
+A is another one on each side of the jump.
 """
 
 from __future__ import annotations
@@ -70,9 +71,17 @@ def write_roots(Q: Array, out: Array) -> int:
 
 @helper
 def _exponential(A: Array, length: float, out: Array) -> None:
-    """Write exp(length A) for a small norm."""
+    """Write exp(length A)."""
     n = A.shape[0]
     term, product = np.zeros((n, n)), np.empty((n, n))
+    norm, squares = 0.0, 0
+    for i in range(n):
+        total = 0.0
+        for j in range(n):
+            total += abs(A[i, j] * length)
+        norm = max(norm, total)
+    while norm > _SERIES and squares < 60:
+        norm, squares, length = 0.5 * norm, squares + 1, 0.5 * length
     out[:] = 0.0
     for i in range(n):
         term[i, i] = out[i, i] = 1.0
@@ -82,6 +91,9 @@ def _exponential(A: Array, length: float, out: Array) -> None:
             for j in range(n):
                 term[i, j] = product[i, j] * length / k
                 out[i, j] += term[i, j]
+    for _ in range(squares):
+        multiply(product, out, out)
+        assign(out, product)
 
 
 @helper
@@ -148,6 +160,51 @@ def _congruence(M: Array, Q: Array, product: Array, out: Array) -> None:
             out[i, j] = total
 
 
+@helper
+def _reduced(A: Array, length: float, out: Array) -> None:
+    """Write A, made smaller where its norm times the length is above `_CARRIED`."""
+    n, norm = A.shape[0], 0.0
+    for i in range(n):
+        total = 0.0
+        for j in range(n):
+            total += abs(A[i, j])
+        norm = max(norm, total * length)
+    for i in range(n):
+        for j in range(n):
+            out[i, j] = A[i, j] * (_CARRIED / norm if norm > _CARRIED else 1.0)
+
+
+@helper
+def _noise_across(times: Array, slopes: Array, e: int, G: Array, length: float, out: Array) -> None:
+    """Write the noise of a substep in which df/dx jumps, carried to its middle, where event e (E, 2) ends.
+
+    `slopes` (E, n, n) are df/dx at the ends of the events, which end at jumps, too.
+    """
+    n, middle = G.shape[0], times[e, 1]
+    A, Q, M, E, product = np.empty((n, n)), np.empty((n, n)), np.empty((n, n)), np.empty((n, n)), np.empty((n, n))
+    out[:] = 0.0
+    for side in (-1, 1):
+        M[:] = 0.0
+        for i in range(n):
+            M[i, i] = 1.0
+        f, now, source = e if side < 0 else e + 1, middle, e
+        while 0 <= f < times.shape[0]:
+            own = now - max(times[f, 0], middle - 0.5 * length) if side < 0 else min(times[f, 1], middle + 0.5 * length) - now
+            if own <= 0.0:
+                break
+            _reduced(slopes[source], own, A)
+            noise_about(A, G, own, Q)
+            _exponential(A, -0.5 * side * own, E)
+            multiply(product, M, E)
+            multiply(M, product, E)  # the way from the far end, product that from its middle
+            _congruence(product, Q, A, E)
+            for i in range(n):
+                for j in range(n):
+                    out[i, j] += E[i, j]
+            f, now = f + side, now + side * own
+            source = f
+
+
 @kernel(types.void(F2, F2, types.float64, F2))
 def noise_about_middle(A: Array, G: Array, length: float, out: Array) -> None:
     """Write the covariance (n, n) of the noise of a substep, carried to its middle."""
@@ -198,36 +255,36 @@ def kick_roots(motion: Any, events: Any, A: Array, length: float, about: Array, 
         out: receives the roots.
     """
     times, places, given = events[0], events[1], events[2]
-    n, width, mean, scale = about.shape[1], 0, about[0], about[1]
+    n, width, mean, scale, count = about.shape[1], 0, about[0], about[1], places.shape[0]
     blocks = (block_of(motion[0]), block_of(motion[1]), block_of(motion[4]))
     buffers = buffers_of(motion, events)
     x, none, at = np.zeros((motion[0][3].size, BLOCK)), np.empty((1, BLOCK)), np.empty(n)
-    Q, pivots = np.empty((n, n)), np.empty(n, np.int64)
+    Q, pivots, ends = np.empty((n, n)), np.empty(n, np.int64), np.empty((count, n, n))
     for d in range(n):
         x[d, 0] = mean[d]
-    for e in range(places.shape[0]):
+    for e in range(count):
         if not A.size:
             run_event(motion, events, e, blocks, x, none, buffers, 1)
-        j = places[e, 0]
-        if j < 0:
-            continue
-        slope = slopes[j]
+        j, slope = places[e, 0], ends[e]
         if A.size:
             assign(slope, A)
-        else:
+        elif j >= 0 or count > slopes.shape[0] + 1:
             for d in range(n):
                 at[d] = x[d, 0]
             _slopes(motion[0], blocks[0], motion[2], at, _STEP * scale, times[e, 1], given[e, 1], slope)
-            norm = 0.0
-            for row in range(n):
-                total = 0.0
-                for column in range(n):
-                    total += abs(slope[row, column])
-                norm = max(norm, total * length)
-            if norm > _CARRIED:
-                for row in range(n):
-                    for column in range(n):
-                        slope[row, column] *= _CARRIED / norm
-        noise_about(slope, G[j if G.shape[0] > 1 else 0], length, Q)
+        if j >= 0 and A.size:
+            assign(slopes[j], slope)
+        elif j >= 0:
+            _reduced(slope, length, slopes[j])
+    for e in range(count):
+        j = places[e, 0]
+        if j < 0:
+            continue
+        own = G[j if G.shape[0] > 1 else 0]
+        before, after = times[e, 0] > times[e, 1] - 0.5 * length, e + 1 < count and times[e + 1, 1] < times[e, 1] + 0.5 * length
+        if not A.size and count > slopes.shape[0] + 1 and (before or after):
+            _noise_across(times, ends, e, own, length, Q)
+        else:
+            noise_about(slopes[j], own, length, Q)
         width = max(width, root_of(Q, out[j], pivots))
     return width

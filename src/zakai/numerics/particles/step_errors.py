@@ -17,7 +17,8 @@ Array = Any
 class StepErrors(NamedTuple):
     """Pilots (n, P) at the start, after coarse and after fine substeps with the same noise, with the log weights (P,) of both.
 
-    `angles` (n,) says which states are angles, `scale` (n,) are the standard deviations by which errors are judged.
+    `angles` (n,) says which states are angles, `scale` (n,) are the standard deviations by which errors are judged, and
+    `variances` (n,) are by how much the noise of the coarse substeps has more variance at the end.
     """
 
     start: Array
@@ -27,6 +28,7 @@ class StepErrors(NamedTuple):
     fine_gained: Array
     angles: Array
     scale: Array
+    variances: Array
 
 
 @helper
@@ -45,13 +47,13 @@ def _variance(row: Array) -> float:
     return total / row.size
 
 
-@kernel(types.void(types.NamedTuple((F2, F2, F1, F2, F1, types.boolean[::1], F1), StepErrors), types.float64, F1, F1))
+@kernel(types.void(types.NamedTuple((F2, F2, F1, F2, F1, types.boolean[::1], F1, F1), StepErrors), types.float64, F1, F1))
 def step_errors(pilots: Any, least: float, shift: Array, largest: Array) -> None:
     """Write the shift of the mean (n,), and the largest error of a mean or a deviation without and with that of the pilots.
 
     What contracts in the interval is judged by the deviation at its end, but by no less than the share `least` of `scale`.
     """
-    start, coarse, coarse_gained, fine, fine_gained, angles, scale = pilots
+    start, coarse, coarse_gained, fine, fine_gained, angles, scale, variances = pilots
     n, count = start.shape
     weight, parts = coarse_gained - fine_gained, np.empty((3, count))
     weight -= _mean(weight)
@@ -66,6 +68,7 @@ def step_errors(pilots: Any, least: float, shift: Array, largest: Array) -> None
                 apart -= 2.0 * math.pi * math.floor(apart / (2.0 * math.pi) + 0.5)
             parts[0, i] = apart
             parts[1, i] = apart * (fine[d, i] - middle) / spread
+            parts[1, i] += 0.5 * variances[d] / spread
             parts[2, i] = weight[i] * (fine[d, i] - middle)
         shift[d] = _mean(parts[0]) + _mean(parts[2])
         for part in range(3):
