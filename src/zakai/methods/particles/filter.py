@@ -34,7 +34,7 @@ from zakai.methods.particles.interval import (
 from zakai.methods.particles.islands import CAUTION, FEW_ISLANDS, Islands, regression
 from zakai.methods.particles.moments import moments_of
 from zakai.methods.particles.programs import Array
-from zakai.methods.particles.proposals import TEMPER_BELOW, advanced
+from zakai.methods.particles.proposals import HOPELESS, TEMPER_BELOW, advanced
 from zakai.methods.particles.state import BEFORE_MOVES, MOVE, PILOT, PRIOR, RESAMPLING, Cloud, Control, Prepared, Rule, State
 from zakai.methods.particles.window import Window, taken
 from zakai.methods.system.escape_of_states import RARE, check_escape
@@ -44,7 +44,6 @@ from zakai.numerics.particles.random import uniform_number
 
 RESAMPLE_BELOW = 0.5  # effective share of the particles
 DOUBTFUL = 16  # resamplings after an interval that left few particles, in which standard errors are lower bounds
-HOPELESS = 0.01  # effective share of the particles below which their number is not raised
 # The past is moved where that pays: by error^2 x time, with N variance of a mean, in variances of the state, as error^2.  What
 # ancestors add to that, beyond what the last move left, is taken away from later steps, and as the ancestors that are lost before
 # a move cannot come back, `MOVE_WORTH` times as much as has added up since the last one counts (error^2 x time of the turn is a
@@ -137,7 +136,7 @@ def _step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[Stat
     scale = np.maximum(system.scales(before.cov), 1e-12)
     observed = _observed(prepared, interval, values)
     wanted, size = _wanted(rule, len(weights), control.variance), effective(weights)
-    if size < HOPELESS * len(weights):  # more of them would be of no use
+    if size < HOPELESS * len(weights):  # more particles would be of no use
         wanted = min(wanted, len(weights))
     # A change of their number alone would resample weights that the next may undo.
     count = wanted if size < RESAMPLE_BELOW * len(weights) else None
