@@ -324,3 +324,16 @@ def test_a_double_well_is_smoothed_from_a_broad_prior(variance):
     assert not result.warnings
     np.testing.assert_allclose(result.mean[0, 0], mean, atol=5e-4 * scale)
     np.testing.assert_allclose(np.sqrt(result.cov[0, 0, 0]), deviation, rtol=5e-4)
+
+
+def test_a_law_whose_density_underflows_is_smoothed_by_both_methods():
+    # A rounded reading: beyond a few deviations of the noise erf - erf is zero, and its logarithm minus infinity.
+    law = "log(erf((z + 0.25 - x)/0.0707) - erf((z - 0.25 - x)/0.0707)) - log(2)"
+    model = zakai.Model(
+        state=["x"], drift=["-(x - 1)/4"], diffusion=[["0.3"]], observed=["z"], observation_kind="samples",
+        observation_log_density=law, prior={"kind": "gaussian", "mean": [0], "cov": [[1.0]]},
+    )  # fmt: skip
+    record = zakai.Record(0.5 * np.arange(1, 9), [0.0, 0.5, 0.5, 0.5, 1.0, 1.0, 0.5, 1.0], "samples")
+    one, other = (zakai.smooth(model, record, method) for method in ("limited-direct", "yau-yau"))
+    assert one.warnings == other.warnings == []
+    np.testing.assert_allclose(one.mean, other.mean, atol=1e-7)

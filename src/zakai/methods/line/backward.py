@@ -143,7 +143,10 @@ def step(prepared: Prepared, k: int, message: Message, observed: np.ndarray, sta
     before = message.variance
     inside, likelihood = acting_inside(prepared, k), factor_of(prepared, k, observed, message.window)
     if likelihood is not None:
-        message = message._replace(logs=message.logs + likelihood.logs(message.window.points).real)
+        logs = message.logs + likelihood.logs(message.window.points).real
+        # Of a law whose density underflows: what is between points follows from them.
+        finite = np.isfinite(logs)
+        message = message._replace(logs=np.where(finite, logs, np.min(logs[finite]) if finite.any() else np.nan))
     if length == 0:
         return message
     between = message.variance
