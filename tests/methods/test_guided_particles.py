@@ -532,6 +532,7 @@ def test_an_outlier_that_the_noise_of_its_interval_does_not_explain_moves_the_pa
 
 def test_the_density_is_lost_where_one_particle_has_the_weight():
     prior = {"kind": "mixture", "weights": [0.5, 0.5], "means": [[0.0, 0.0], [1.0, 0.0]], "covs": [[1.0, 1.0], [1.0, 1.0]]}
-    model = zakai.Model(**{**OSCILLATOR, "prior": prior}, observation=["x"], observation_kind="samples", observation_noise=[[0.04]])
+    keys = {**OSCILLATOR, "prior": prior, "observation": ["x"], "observation_kind": "samples", "observation_noise": [[0.04]]}
+    model = zakai.Model(**keys)
     result = zakai.filter(model, zakai.Record([0.01, 0.1, 0.2], [7.0, 7.0, 7.0], "samples"), PARTICLES)
     assert result.warnings[0].startswith("the density was lost at t = 0.01") and "largest_weight" in result.warnings[0]

@@ -97,7 +97,8 @@ def test_the_noise_of_a_substep_in_which_an_input_jumps_has_the_rates_of_both_si
     # The rate falls from 3 to 0.2 within the interval, of which one substep is one half.
     model = zakai.Model(
         state=["x", "y"], drift=["-q*x", "-q*(y - x)"], diffusion=[["1", "0"], ["0", "0.5"]], observation=["x"], inputs=["q"],
-        observation_kind="samples", observation_noise=[["0.2"]], prior={"kind": "gaussian", "mean": [0.0, 0.0], "cov": [1.0, 1.0]},
+        observation_kind="samples", observation_noise=[["0.2"]],
+        prior={"kind": "gaussian", "mean": [0.0, 0.0], "cov": [1.0, 1.0]},
     )  # fmt: skip
     inputs = zakai.Inputs([0.0, 0.7, 1.3], [3.0, 0.2, 3.0])
     record = zakai.Record([0.5, 1.0, 1.5], [np.nan, 2.0, np.nan], "samples", inputs=inputs)
