@@ -105,3 +105,14 @@ def test_the_noise_of_a_substep_in_which_an_input_jumps_has_the_rates_of_both_si
     result, exact = zakai.filter(model, record, PARTICLES, particles=20000), zakai.filter(model, record, "kalman-bucy")
     assert np.abs(np.sqrt(result.variance / exact.variance)[1:] - 1.0).max() < 0.02
     assert (np.abs(result.mean - exact.mean)[1:] / np.sqrt(exact.variance[1:])).max() < 0.03
+
+
+def test_dry_friction_near_rest_needs_no_shorter_steps_than_the_noise():
+    # Near zero every step is too long for the sign of the velocity, relative to the velocity.
+    model = zakai.Model(
+        state=["v"], drift=["-0.4*v - sign(v)"], diffusion=[["0.3"]], observation=["v"], observation_kind="samples",
+        observation_noise=[["0.01"]], prior={"kind": "gaussian", "mean": [0.0], "cov": [0.1]},
+    )  # fmt: skip
+    record = zakai.Record(0.25 * np.arange(1, 9), [0.1, 0.05, -0.1, 0.0, 0.1, 0.2, 0.1, 0.0], "samples")
+    result, exact = zakai.filter(model, record, PARTICLES, particles=5000), zakai.filter(model, record, "yau-yau")
+    assert (np.abs(result.mean - exact.mean)[1:] / np.sqrt(exact.variance[1:])).max() < 0.06

@@ -147,7 +147,8 @@ def _until(events: Events, first: int) -> Events:
     places = events.places[: first + 1].copy()
     places[:, :2] = -1
     rows = np.zeros((0, 3), np.int64)
-    return Events(events.times[: first + 1], places, events.given[: first + 1], events.roots[:0], rows)
+    part = slice(first + 1)
+    return Events(events.times[part], places, events.given[part], events.roots[:0], rows, events.spreads[part])
 
 
 def _joined(

@@ -40,6 +40,7 @@ class Events(NamedTuple):
     given: Array
     roots: Array
     rows: Array
+    spreads: Array
 
     @property
     def width(self) -> int:
@@ -77,4 +78,5 @@ def with_update(events: Events, system: System, observed: Observed) -> Events:
         times=np.append(events.times, [[observed.time, observed.time]], axis=0),
         places=np.append(events.places, [[-1, -1, UPDATE]], axis=0),
         given=np.append(given, row, axis=0),
+        spreads=np.append(events.spreads, events.spreads[-1:], axis=0),
     )

@@ -173,7 +173,7 @@ class Motion:
             none = np.zeros((0, system.r if system.kind else system.n, 0))
             row = np.array([[start, start]])
             rows, given = np.zeros((0, 3), np.int64), np.zeros((1, 2, system.drift.width))
-            return Events(row, np.array([[-1, 0, 4]]), given, none, rows), none
+            return Events(row, np.array([[-1, 0, 4]]), given, none, rows, np.zeros((1, system.n))), none
         step = length / count
         ends = np.append(start + (np.arange(count) + 0.5) * step, stop)
         places = np.full((count + 1, 3), -1)
@@ -193,7 +193,16 @@ class Motion:
         width = roots.shape[2]
         rows = np.empty((count, 3), np.int64)
         rows[:, 0], rows[:, 1], rows[:, 2] = np.arange(count) * (width + coin), width, coin
-        return Events(times, places, given, roots, rows), slopes
+        spreads = np.repeat(self._spread(roots, mean, start, given[0, 0])[None], len(times), axis=0)
+        return Events(times, places, given, roots, rows, spreads), slopes
+
+    def _spread(self, roots: Array, mean: Array, t: float, given: Array) -> Array:
+        """Return the standard deviations (n,) of the noise of the first kick, of roots (J, n or r, d), at a mean."""
+        if self.system.kind == ADDITIVE or not roots.size:
+            return np.sqrt(np.sum(roots[:1] ** 2, axis=(0, 2))) if roots.size else np.zeros(self.system.n)
+        points = np.concatenate([np.repeat(mean[:, None], roots.shape[2], axis=1), roots[0]])
+        columns = self.values(self.arrays[1], points, t, given)[: self.system.n]
+        return np.sqrt(np.sum(np.where(np.isfinite(columns), columns, 0.0) ** 2, axis=1))
 
     def _inputs(self, interval: Interval, t: float, before: bool) -> Array | None:
         known = interval.inputs
@@ -256,7 +265,8 @@ class Motion:
         A = self.constant_matrix if system.affine else np.zeros((0, 0))
         slopes, out = np.empty((2, len(kicks), system.n, system.n))
         none = np.zeros((0, system.n, 0)), np.zeros((len(kicks), 3), np.int64)
-        width = noise_kernels.kick_roots(self.arrays, (times, places, given, *none), A, step, about, G, slopes, out)
+        events = (times, places, given, *none, np.zeros((len(times), system.n)))
+        width = noise_kernels.kick_roots(self.arrays, events, A, step, about, G, slopes, out)
         return np.ascontiguousarray(out[:, :, :width]), slopes
 
     @cached_property

@@ -53,7 +53,7 @@ def _window(prepared: Prepared, window: Window, count: int) -> bool:
         E, J = len(events.times), len(events.rows)
         if events.times.shape != (E, 2) or events.places.shape != (E, 3) or events.given.shape != (E, 2, width):
             return False
-        if events.roots.shape[:2] != (J, rows) or events.rows.shape != (J, 3) or not E:
+        if events.roots.shape[:2] != (J, rows) or events.rows.shape != (J, 3) or events.spreads.shape != (E, n) or not E:
             return False
         places = events.places
         if not np.isin(places[:, 2], (UPDATE, 2, 4)).all():

@@ -28,7 +28,8 @@ _WIDER = 1.15  # variance of the Gaussian over that of the linearised posterior
 _INFORMED = 0.1  # information of a direction of the noise, over that of N(0, 1), from which moves follow it
 _EMPTY = np.zeros(0, np.int32)
 _NO_EVENTS = Events(
-    np.zeros((0, 2)), np.zeros((0, 3), np.int64), np.zeros((0, 2, 0)), np.zeros((0, 0, 0)), np.zeros((0, 3), np.int64)
+    np.zeros((0, 2)), np.zeros((0, 3), np.int64), np.zeros((0, 2, 0)), np.zeros((0, 0, 0)), np.zeros((0, 3), np.int64),
+    np.zeros((0, 0)),
 )  # fmt: skip
 
 
@@ -230,8 +231,8 @@ def joined(parts: tuple[Events, ...]) -> Events:
         places.append(place)
         rows.append(row)
         kicks, noise = kicks + len(part.rows), noise + part.width
-    times, given = (np.concatenate([part[i] for part in parts]) for i in (0, 2))
-    return Events(times, np.concatenate(places), given, np.concatenate(roots), np.concatenate(rows))
+    times, given, spreads = (np.concatenate([getattr(part, name) for part in parts]) for name in ("times", "given", "spreads"))
+    return Events(times, np.concatenate(places), given, np.concatenate(roots), np.concatenate(rows), spreads)
 
 
 class _Precision(NamedTuple):

@@ -28,22 +28,24 @@ Array = Any
 ADDITIVE, COMMUTING, ORDERED = 0, 1, 2
 # A step is too long for a particle where the estimate of its error by the slopes is this share of the state: a linear decay at a
 # rate 2 / step.  It is halved, three times at once, and again where that is not enough.  What most particles need is measured
-# beforehand; this is for those far out, which a stiff drift would throw to infinity.
+# beforehand; this is for those far out, which a stiff drift would throw to infinity.  By less than so much of the noise of a
+# substep no particle is thrown far: dry friction holds a velocity near zero, where every step is too long for its sign.
 _ROUGH, _PARTS, _LEVELS = 0.25, 8, 3
 UPDATE = 0  # instead of the evaluations of a flow
 # Drift, fields of the noise, ends of the domain, the kind of the noise, and what an observation makes of the state.
 MOTION = types.Tuple((PROGRAM, PROGRAM, BOX, types.int64, PROGRAM))
 # Times (E, 2), [root, observation, stages] (E, 3): what follows each flow or -1, and its evaluations, 2 or 4, or `UPDATE`; given
-# numbers at both ends (E, 2, L), roots (J, n or r, d), and the first row of the noise of each root, its width, and 1 where a coin
-# follows (J, 3).
-EVENTS = types.Tuple((F2, I2, F3, F3, I2))
+# numbers at both ends (E, 2, L), roots (J, n or r, d), the first row of the noise of each root, its width, and 1 where a coin
+# follows (J, 3), and the standard deviations of the noise of a substep (E, n).
+EVENTS = types.Tuple((F2, I2, F3, F3, I2, F2))
 
 
 class Buffers(NamedTuple):
     """What is overwritten.
 
     Rows of a block (rows, BLOCK), given numbers (L,), the times (2,) of a kick, and of the particles of a block: which a step is
-    too long for, their places, and which needed a still shorter one (BLOCK,).
+    too long for, their places, and which needed a still shorter one (BLOCK,).  `noise` (n,) are the standard deviations of the
+    noise of a substep.
     """
 
     work: Array
@@ -52,6 +54,7 @@ class Buffers(NamedTuple):
     rough: Array
     marked: Array
     failed: Array
+    noise: Array
 
 
 class Stretch(NamedTuple):
@@ -95,7 +98,7 @@ ARRIVAL = types.NamedTuple((F2, F1, F3), Arrival)
 @helper
 def _runge_kutta(program: Any, values: Array, x: Array, box: Any, stretch: Any, buffers: Any, size: int) -> int:
     """Write the change of x (rows, size) by one Runge-Kutta step; mark the particles that it is too long for, and count them."""
-    outputs, work, row, rough = program[3], buffers.work, buffers.row, buffers.rough
+    outputs, work, row, rough, noise = program[3], buffers.work, buffers.row, buffers.rough, buffers.noise
     length, times, given, stages, begin, part = stretch
     count, rows, n = outputs.size, x.shape[0], box[0].size
     point, total, excess = work[:rows], work[rows : rows + count], work[rows + count : rows + count + n]
@@ -138,7 +141,7 @@ def _runge_kutta(program: Any, values: Array, x: Array, box: Any, stretch: Any, 
     for d in range(n):
         for i in range(size):
             end = x[d, i] + total[d, i]
-            rough[i] += 0.0 if abs(excess[d, i]) <= _ROUGH * (abs(x[d, i]) + abs(end)) else 1.0  # NaN is rough, too
+            rough[i] += 0.0 if abs(excess[d, i]) <= _ROUGH * (abs(x[d, i]) + abs(end) + noise[d]) else 1.0  # NaN is rough, too
     left = 0
     for i in range(size):
         left += rough[i] > 0.0
@@ -203,7 +206,8 @@ def _kick(motion: Any, values: Array, x: Array, kick: Any, buffers: Any, size: i
         return
     # The point of the fields: the state, then a coefficient for each field.
     r = root.shape[0]
-    point, rest = work[: n + r], Buffers(work[n + r :], buffers.row, buffers.time, buffers.rough, buffers.marked, buffers.failed)
+    point = work[: n + r]
+    rest = Buffers(work[n + r :], buffers.row, buffers.time, buffers.rough, buffers.marked, buffers.failed, buffers.noise)
     for d in range(n):
         for i in range(size):
             point[d, i] = x[d, i]
@@ -238,12 +242,14 @@ def _update(program: Any, values: Array, x: Array, box: Any, time: float, given:
 @helper
 def run_event(motion: Any, events: Any, e: int, blocks: Any, x: Array, noise: Array, buffers: Any, size: int) -> None:
     """Advance x (rows, size) by one event; `noise` (D, size) is that of all events."""
-    times, places, given, roots, rows = events
+    times, places, given, roots, rows, spreads = events
     n, box = motion[2][0].size, motion[2]
     if places[e, 2] == UPDATE:
         _update(motion[4], blocks[2], x, box, times[e, 1], given[e, 0], size)
         return
     if times[e, 1] != times[e, 0]:
+        for d in range(n):
+            buffers.noise[d] = spreads[e, d]
         stretch = Stretch(times[e, 1] - times[e, 0], times[e], given[e], places[e, 2], 0.0, 1.0)
         _flow(motion[0], blocks[0], x, box, stretch, buffers, size)
     r = places[e, 0]
@@ -271,7 +277,8 @@ def buffers_of(motion: Any, events: Any) -> Any:
     """Return what `run_event` overwrites."""
     n, r = motion[2][0].size, events[3].shape[1]
     work, row = np.empty((9 * (n + r + 2), BLOCK)), np.empty(events[2].shape[2])
-    return Buffers(work, row, np.empty(2), np.empty(BLOCK), np.empty(BLOCK, np.int64), np.empty(BLOCK))
+    noise = np.zeros(motion[2][0].size)
+    return Buffers(work, row, np.empty(2), np.empty(BLOCK), np.empty(BLOCK, np.int64), np.empty(BLOCK), noise)
 
 
 @kernel(types.void(MOTION, EVENTS, F2, F2, types.int64, types.int64, ARRIVAL))
