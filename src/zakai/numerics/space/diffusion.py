@@ -107,7 +107,7 @@ def diffused(values: Array, grid: Grid, noise: Array, adjoint: bool = False) -> 
         noise: C at the points of the grid (J, n, n).
     """
     operator = _Operator(values, grid, noise, adjoint)
-    return operator.exponential(values) if operator.entries else values
+    return operator.exponential(values) if operator.radius > 0.0 else values
 
 
 def spread_out(
