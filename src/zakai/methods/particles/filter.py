@@ -102,12 +102,12 @@ def begun_at(prepared: Prepared, particles: Array) -> State:
 
 
 def _at_start(prepared: Prepared, particles: Array, first: Array, gaussian: tuple[Array, Array]) -> State:
-    system, count = prepared.system, particles.shape[1]
+    system, count, n = prepared.system, particles.shape[1], prepared.model.n
     width = system.law.width if system.law is not None else system.factor.width  # type: ignore[union-attr]
     window = Window.begin(particles, first, gaussian, (width, len(prepared.motion.law[3])))
-    logs, n = np.full(count, -np.log(count)), prepared.model.n
     islands, control = Islands.begin(count, n), Control(variance=VARIANCE * count / prepared.rule.particles)
-    return State(particles, logs, window, islands, control, np.zeros(n), np.zeros(system.n), np.ones(system.n))
+    logs, shift = np.full(count, -np.log(count)), np.zeros(n)
+    return State(particles, logs, window, islands, control, shift, np.zeros(system.n), np.ones(system.n))
 
 
 def reduced(state: State) -> State:
@@ -122,9 +122,8 @@ class Advanced(NamedTuple):
 
     `weights` (N,) are those of the particles, `gained` is the increment of the log-likelihood, `noise` (D, N) that of the
     interval, `predicted` (n',) the spread of the coordinates before the weights of the observation act, `deviations` (n,)
-    those of the states before it, `acceptance` that of moves between powers of the likelihood; the next one is the share of
-    the particles that left every bounded set, and `unseen` says that few particles are left by an observation that says
-    nothing of the noise.
+    those of the states before it, `acceptance` that of moves between powers of the likelihood, `lost` the share of the particles
+    that left every bounded set; `unseen`: few particles are left by an observation that says nothing of the noise.
     """
 
     cloud: Cloud
@@ -152,7 +151,7 @@ def step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[State
 
 FIGURES = (
     "effective_sample_size", "particles", "founders", "largest_weight", "tempering_levels", "acceptance", "time_error",
-    "monte_carlo_error", "log_likelihood_error", "lower_bound", "uncertain_error", "guided", "moved", "linear_states",
+    "monte_carlo_error", "log_likelihood_error", "lower_bound", "uncertain_error", "guided", "moved", "linear_states", "substeps",
 )  # fmt: skip
 
 
@@ -262,6 +261,7 @@ def _step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[Stat
         "guided": float(done.guided),
         "moved": moved,
         "linear_states": float(system.linear),
+        "substeps": float(steps.scheme.substeps),
     }
     info = Info(done.gained, end.mean[:n], cov, health, np.sqrt(variance + shift**2), float(np.sqrt(evidence)))
     control = control._replace(
