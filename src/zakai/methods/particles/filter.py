@@ -14,7 +14,6 @@ References:
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, NamedTuple
@@ -22,33 +21,25 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from zakai.methods._protocol import Info
-from zakai.methods.particles.block import drawn_again
+from zakai.methods.particles.block import FEW, TRIED, drawn_again
 from zakai.methods.particles.events import Events, Interval, Observed, with_update
-from zakai.methods.particles.interval import (
-    MOST_SUBSTEPS,
-    MOST_TIME_ERROR,
-    OF_RANDOM_ERROR,
-    PILOTS,
-    TIME_ERROR,
-    Pilots,
-    Scheme,
-    Steps,
-    steps_of,
-)
 from zakai.methods.particles.islands import CAUTION, FEW_ISLANDS, Islands, regression
 from zakai.methods.particles.moments import moments_of
 from zakai.methods.particles.programs import Array
 from zakai.methods.particles.state import Cloud, Control, Prepared, Rule, State
+from zakai.methods.particles.substeps import allowed_error, substeps
 from zakai.methods.particles.window import Target, Window, taken
 from zakai.methods.system.escape_of_states import RARE, check_escape
 from zakai.numerics.particles.even import Even, even_normals
-from zakai.numerics.particles.population import effective, next_power, normalised, systematic
-from zakai.numerics.particles.random import uniform_number
+from zakai.numerics.particles.population import effective, next_power, normalised
 
-NOISE, RESAMPLING, PILOT, GUIDE, MOVE, PRIOR, LEVELS = range(7)  # uses of random numbers
+NOISE, RESAMPLING, GUIDE, MOVE, PRIOR, LEVELS = 0, 1, 3, 4, 5, 6  # uses of random numbers, beside that of `substeps`
 RESAMPLE_BELOW = 0.5  # effective share of the particles
-GUIDE_BELOW = 0.3  # effective share below which the noise is drawn again from the linearised posterior
+GUIDE_BELOW = 0.3  # effective share below which the noise of an interval, then of the last ones, is drawn again
 DOUBTFUL = 16  # resamplings after an interval that left few particles, in which standard errors are lower bounds
+# Least ratio of the effective sizes after and before that, and in how many intervals it rests at most where it is in vain, twice
+# as many each time.
+BLOCK_GAIN, MOST_RESTS = 1.5, 16
 TEMPER_BELOW, TEMPER_FLOOR = 0.1, 400  # effective share and number below which powers of the likelihood are taken
 HOPELESS = 0.01  # effective share of the particles below which their number is not raised
 GUIDE_SHARE, FIRST_SHARE = 0.1, 0.2  # of plain noise in draws from the linearised posterior, of an interval and of the prior
@@ -65,17 +56,10 @@ MOST_LEVELS = 60
 # of the last, and in a step its own and as many as the rest of it takes.  (Measured: 30 to 38 ns in a move, 0.3 us and 40 ns a
 # number in a step.)
 MOVE_GAIN, MOVE_WORTH, FORGOTTEN, STEP_WORK, LEAST_RATE = 1.5, 8.0, 0.98, 4.0, 0.3
-TRIED, FEW = 16, 128  # a move is tried on one particle in so many, where these are as many at least
 MOVE_CONTROL = (1.0, 1.2, 4.0, 0.4, 1.0)  # power, change, most sweeps, rho, share
 VARIANCE = 5.0  # that of a mean times N, in variances of the state, that the number of particles is chosen for
 MOST_GROWTH = 4
 REPEATED, NARROWEST = 2.0, 0.02  # excess of the time error at which an interval is repeated, and least narrowing that counts
-# Of the time error: the share of the allowed one below which it holds in so many more intervals; in how many it does at most,
-# twice as many each time, where it was no more than so many times the substeps that were expected; the ratio of errors by length
-# up to which it holds.  It does not where the drift moves the mean by more than a deviation in the interval, and so many times as
-# fast as where it was measured, or where df/dx is so many times as large: the error is of the third order in it, and twice it is
-# within what `SURE` leaves.
-SURE, TRUSTED, MOST_TRUSTED, FORESEEN, LONGER, FASTER, STEEPER = 0.5, 4, 8, 1.3, 4.0, 2.0, 2 ** (1 / 3)
 
 
 def init(prepared: Prepared, prior: Any) -> State:
@@ -123,7 +107,8 @@ class Advanced(NamedTuple):
     `weights` (N,) are those of the particles, `gained` is the increment of the log-likelihood, `noise` (D, N) that of the
     interval, `predicted` (n',) the spread of the coordinates before the weights of the observation act, `deviations` (n,)
     those of the states before it, `acceptance` that of moves between powers of the likelihood, `lost` the share of the particles
-    that left every bounded set; `unseen`: few particles are left by an observation that says nothing of the noise.
+    that left every bounded set; `unseen`: few particles are left by an observation that says nothing of the noise; `block` is 1
+    where the noise of the last intervals was drawn again, -1 where that was tried in vain.
     """
 
     cloud: Cloud
@@ -137,6 +122,7 @@ class Advanced(NamedTuple):
     acceptance: float = np.nan
     lost: float = 0.0
     unseen: bool = False
+    block: int = 0
 
 
 def step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[State, Info]:
@@ -179,10 +165,10 @@ def _step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[Stat
         # Errors are measured in deviations after the observation, by how much the last one, or this one, has narrowed them.
         steps, control = substeps(prepared, interval, values, state, (before.mean, narrow * scale))
         events = with_update(motion.events(interval, steps.scheme, values, before.mean, scale), system, observed)
-        done = _advanced(prepared, start, events, observed, number, rank)
+        done = _advanced(prepared, start, events, observed, number, rank, control.rest > 0)
         after = moments_of(system, done.cloud.particles, done.weights)
         found_narrow = _narrowing(after.cov, done.deviations)
-        if last_turn or steps.error * narrow <= REPEATED * _allowed(control, len(weights)) * found_narrow:
+        if last_turn or steps.error * narrow <= REPEATED * allowed_error(control, len(weights)) * found_narrow:
             break
         narrow = found_narrow
     last = (steps.shift, narrow * scale) if steps.measured else (state.last_shift, state.last_scale)
@@ -264,57 +250,15 @@ def _step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[Stat
         "substeps": float(steps.scheme.substeps),
     }
     info = Info(done.gained, end.mean[:n], cov, health, np.sqrt(variance + shift**2), float(np.sqrt(evidence)))
+    failed = 0 if done.block > 0 else min(max(2 * control.failed, 1), MOST_RESTS) if done.block else control.failed
+    rest = failed if done.block else max(control.rest - 1, 0)
     control = control._replace(
-        interval=number, narrow=found_narrow, losses=losses, work=work, excess=excess, floor=floor, rate=rate,
+        interval=number, failed=failed, rest=rest,
+        narrow=found_narrow, losses=losses, work=work, excess=excess, floor=floor, rate=rate,
         doubtful_until=until, shifted=shifted, present=present, known=known, remembered=remembered,
         variance=0.8 * control.variance + 0.2 * len(weights) * float(share.mean()),
     )  # fmt: skip
     return State(cloud.particles, cloud.logs, cloud.window, islands, control, shift, *last), info
-
-
-def _allowed(control: Control, count: int) -> float:
-    """Return the error of a mean by the time step, in standard deviations, that an interval may have."""
-    return min(max(OF_RANDOM_ERROR * math.sqrt(control.variance / count), TIME_ERROR), MOST_TIME_ERROR)
-
-
-def substeps(
-    prepared: Prepared, interval: Interval, values: Array, state: State, about: tuple[Array, Array]
-) -> tuple[Steps, Control]:
-    """Return the substeps of an interval, measured where the last measurement does not hold any more, and the controls."""
-    control, (mean, scale), hold = state.control, about, prepared.model.input_hold
-    length = interval.stop - interval.start
-    if length <= 0:
-        return Steps(Scheme(1, 4), np.zeros(len(mean)), 0.0, 0.0), control
-    # The error of an interval is of the third order of its length, and was measured in deviations of that time.
-    jumps, pace = interval.inputs_change(hold), prepared.motion.pace(interval, values, mean, scale)
-    ratio = (length / control.length) ** 3 if control.length and not jumps else np.inf
-    ratio *= max(1.0, float((state.last_scale / scale).max()))
-    allowed = _allowed(control, len(state.log_weights))
-    needed = control.substeps * np.sqrt(control.error * ratio / allowed)
-    guess = max(1, int(np.ceil(needed))) if needed <= MOST_SUBSTEPS else max(1, control.substeps)
-    alike, steepness = pace * length <= 1.0, 0.0
-    if not alike:  # the mean moves to where the error may be another one
-        steepness = prepared.motion.steepness(interval, values, mean, scale)
-        alike = pace <= FASTER * control.pace and steepness <= STEEPER * control.steepness
-    if control.trusted and alike and ratio <= LONGER and guess <= MOST_SUBSTEPS:
-        ratio *= (control.substeps / guess) ** 2
-        error = control.error * ratio
-        known = Steps(Scheme(guess, control.stages), state.last_shift * ratio, error, error, False)
-        return known, control._replace(trusted=control.trusted - 1)
-    key = prepared.key(control.interval + 1, PILOT)
-    chosen = np.empty(PILOTS, np.int32)
-    systematic(np.exp(state.log_weights), uniform_number(key), chosen)
-    pilots = Pilots(taken(state.particles, chosen), mean, scale, int(key[0] >> np.uint64(2)), allowed)
-    found = steps_of(prepared.motion, interval, values, pilots, guess)
-    count, stages = found.scheme
-    expected = count * np.sqrt(found.error / allowed) <= FORESEEN * needed
-    trusted = min(max(1, 2 * control.granted), MOST_TRUSTED) if expected else 0
-    trusted = max(trusted, TRUSTED) if found.surely <= SURE * allowed else trusted
-    trusted = 0 if jumps else trusted  # of other inputs than those that the next interval begins with
-    return found, control._replace(
-        substeps=count, stages=stages, error=found.error, length=length, trusted=trusted, granted=trusted, pace=pace,
-        steepness=steepness,
-    )
 
 
 def _observed(prepared: Prepared, interval: Interval, values: Array) -> Observed:
@@ -335,9 +279,12 @@ def _observed(prepared: Prepared, interval: Interval, values: Array) -> Observed
 
 
 def _advanced(
-    prepared: Prepared, cloud: Cloud, events: Events, observed: Observed, number: int, rank: Array
+    prepared: Prepared, cloud: Cloud, events: Events, observed: Observed, number: int, rank: Array, resting: bool
 ) -> Advanced:
-    """Return the particles, with these numbers (N,) within their islands, after an interval and its observation."""
+    """Return the particles, with these numbers (N,) within their islands, after an interval and its observation.
+
+    `resting`: the noise of the last intervals is drawn again only where very few particles are left.
+    """
     system, count = prepared.system, len(cloud.logs)
     single = (np.array([observed.time]), observed.given[None], observed.counted[None])
     target = Target(prepared.motion, events, *single, None, cloud.particles)
@@ -359,17 +306,20 @@ def _advanced(
     target = replace(target, prior=(cloud.window.mean, cloud.window.root) if moving else None)
     first = np.concatenate([cloud.window.first, noise]) if moving else noise
     gaussian = _linearised(target, cloud, plain)
-    if gaussian is not None and not moving and not np.isinf(top) and _uninformed(gaussian, 1.0):
-        return plain._replace(unseen=True)  # moves of noise of which the observation says nothing would be of no use
+    unseen = gaussian is not None and not moving and not np.isinf(top) and _uninformed(gaussian, 1.0)
     even = cloud.islands.even(prepared.key(number, GUIDE), rank)
     best = (gaussian and _guided(target, cloud, plain, gaussian, even)) or Drawn(plain, first, logs, None)
     size = effective(best.after.weights) if np.isfinite(best.after.gained) else 0.0
-    if size < TEMPER_BELOW * count and not moving:
-        block = drawn_again(cloud.window, np.exp(cloud.logs), target, GUIDE_SHARE, even)
+    if size < (TEMPER_BELOW if resting else GUIDE_BELOW) * count and not moving:
+        least = max(BLOCK_GAIN * size / count, TEMPER_BELOW)
+        block = drawn_again(cloud.window, cloud.logs, target, GUIDE_SHARE, even, least)
         found, gained = normalised(cloud.logs + block.logs) if block is not None else (weights, -np.inf)
-        if block is not None and np.isfinite(gained) and effective(found) > max(size, TEMPER_BELOW * count):
+        if block is not None and np.isfinite(gained) and effective(found) > least * count:
             after = cloud._replace(particles=block.particles, logs=cloud.logs + block.logs - gained, window=block.window)
-            return plain._replace(cloud=after, weights=found, gained=gained, noise=block.noise, guided=True)
+            return plain._replace(cloud=after, weights=found, gained=gained, noise=block.noise, guided=True, block=1)
+        plain, best = plain._replace(block=-1), best._replace(after=best.after._replace(block=-1))
+    if unseen:  # moves of noise of which the observation says nothing would be of no use
+        return plain._replace(unseen=True)
     if size >= min(TEMPER_BELOW * count, TEMPER_FLOOR) or not np.isfinite(best.logs).any():
         return best.after
     return _tempered(prepared, target, cloud, best, number)
@@ -454,7 +404,8 @@ def _tempered(prepared: Prepared, target: Target, cloud: Cloud, drawn: Drawn, nu
     after = cloud._replace(particles=particles, window=window)
     noise, guided = np.ascontiguousarray(path[d0:]), fixed is not None
     spreads, weights = (drawn.after.predicted, drawn.after.deviations), np.exp(cloud.logs)
-    return Advanced(after, weights, gained, noise, *spreads, levels, guided, float(np.mean(rates)), drawn.after.lost)
+    done = Advanced(after, weights, gained, noise, *spreads, levels, guided, float(np.mean(rates)), drawn.after.lost)
+    return done._replace(block=drawn.after.block)
 
 
 def _loss(variance: Array, cov: Array, count: int) -> float:
