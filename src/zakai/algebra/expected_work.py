@@ -24,15 +24,17 @@ from zakai.models.prior import DensityPrior, GaussianPrior, MixturePrior
 from zakai.numerics.prior_grid import prior_grid
 
 # `benchmarks/choices.py` prints seconds of an observation; divided by these numbers of points and of particles they are the
-# seconds of a point and of a particle: medians over its systems, with the substeps of an interval, and moves of the past.
-POINT, PARTICLE = 9e-6, 1e-5
+# seconds of a point, and those of a particle over the `GROWTH`-th power of the number of states: medians over its systems, with
+# the substeps of an interval, and moves of the past.  Beyond `USUAL` substeps each takes so many seconds more for each state.
+POINT, PARTICLE, GROWTH = 9e-6, 4e-7, 1.5
+SUBSTEP, USUAL = 8e-8, 4
 AXIS = 32  # points along an axis of a grid for a density near a Gaussian
 MOST_OF_AXIS = {2: 512, 3: 128, 4: 40}  # points along an axis that a grid has at most
 MOST_POINTS = 2**18
 # Seconds of one computation of a density at a point of a grid, of which a substep makes three or more; and how many times the
-# work of particles a grid may take for the first interval, which begins with the prior: "auto" never takes what needs ten times.
-GRID_POINT, MOST_TIMES = 5e-7, 10.0
-WIDE = 4.0  # curvature of a level of h, in deviations of its noise, that adds the points of one more grid
+# work of particles a method may take for one of the first intervals from the prior: "auto" never takes what needs ten times.
+GRID_POINT, MOST_TIMES = 1.5e-7, 10.0
+WIDE = 4.0  # curvature of a level of h, in deviations of its noise, that adds the points of one more grid, or as many particles
 PARTICLES = 5.0  # particles, times the square of the tolerance
 TOLERANCE = 0.03  # of particles, where none is asked for
 DRAWS = 64  # points of the prior at which the sensors and the drift are differentiated
@@ -71,20 +73,18 @@ def expected_work(name: str, model: Model, tolerance: float | None) -> Work | No
     if name == "tensor-train":
         return _of_train(model, tolerance)
     if name == "guided-particles":
-        count = PARTICLES / (TOLERANCE if tolerance is None else tolerance) ** 2
-        return Work(PARTICLE * count, f"{_display.rough(count)} particles")
+        return work_of_particles(model, tolerance, USUAL)
     return None
 
 
-def most_seconds(model: Model, tolerance: float | None) -> float:
-    """Return the work that a method may need for the first interval."""
-    particles = expected_work("guided-particles", model, tolerance)
-    return np.inf if particles is None else MOST_TIMES * particles.seconds
+def work_of_particles(model: Model, tolerance: float | None, substeps: float) -> Work:
+    """Return the work of particles for an observation after so many substeps.
 
-
-def most_points(model: Model, tolerance: float | None) -> float:
-    """Return at how many points a grid may compute a density in the first interval."""
-    return most_seconds(model, tolerance) / GRID_POINT
+    A precise sensor leaves few particles along a curved level of h: they reach it by powers of the likelihood.
+    """
+    count = PARTICLES / (TOLERANCE if tolerance is None else tolerance) ** 2
+    each = PARTICLE * model.n**GROWTH * (1.0 + curvature(model) / WIDE) + SUBSTEP * model.n * max(substeps - USUAL, 0.0)
+    return Work(each * count, f"{_display.rough(count)} particles")
 
 
 def work_of_step(name: str, model: Model, health: Mapping[str, float]) -> Work | None:

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from zakai.engine.driver import check_records
-from zakai.engine.first_interval import first_interval
+from zakai.engine.first_intervals import first_intervals
 from zakai.engine.loop import CHUNK, advance
 from zakai.engine.plan import plan_of
 from zakai.engine.setting import Setting
@@ -73,7 +73,7 @@ def expected_seconds(model: Model, record: Record, method: str = "auto", *, most
     """
     check_records(model, record)
     found = []
-    unfit = first_interval(model, record).fault
+    unfit = first_intervals(model, record).fault
     runs = plan_of(model, model.prior, method, options, unfit=unfit).runs(record, "moments")
     for run in runs:
         found.append(_of_block(run.setting, run.schedule, run.values, most / len(runs)))

@@ -10,7 +10,7 @@ import numpy as np
 
 from zakai._progress import Progress, announced
 from zakai.engine.batch import filter_all
-from zakai.engine.first_interval import first_interval
+from zakai.engine.first_intervals import first_intervals
 from zakai.engine.loop import KEPT_BYTES
 from zakai.engine.plan import Plan, plan_of
 from zakai.engine.results import FilterResult
@@ -122,11 +122,11 @@ def _filter(
     priors: list[Prior | None] = list(prior) if isinstance(prior, Sequence) else [prior] * len(records)
     if len(priors) != len(records):
         raise InputError(f"filter_from: {len(priors)} priors do not go with {len(records)} records; give one for each")
-    found: dict[tuple[int, float, int], Plan] = {}
+    found: dict[tuple[int, float, float, int], Plan] = {}
     plans = []
     for own, one in zip(priors, records, strict=True):
-        first = first_interval(model, one)
-        key = id(own), first.stop, id(first.inputs)
+        first = first_intervals(model, one)
+        key = id(own), first.first, first.typical, id(first.inputs)
         if key not in found:
             found[key] = planned(model, own, method, options, unfit=first.fault)
         plans.append(found[key])

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from itertools import pairwise
 from threading import RLock
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -14,7 +15,7 @@ from zakai.engine.checkpoint import restored, stored
 from zakai.engine.driver import check_model, planned
 from zakai.engine.estimate import Estimate
 from zakai.engine.feed import Feed, Moment
-from zakai.engine.first_interval import FirstInterval, asked
+from zakai.engine.first_intervals import INTERVALS, FirstIntervals, asked
 from zakai.engine.plan import Plan
 from zakai.engine.setting import Setting
 from zakai.engine.versions import other_versions, versions
@@ -42,12 +43,12 @@ def online(
 ) -> Online:
     """Return a filter that receives one observation at a time, and gives the estimate after it.
 
-    Its estimates are those of `zakai.filter` for the same record, to the bit.
+    Its last estimate is that of `zakai.filter` for the same record, to the bit.
 
     Args:
         model: the system, with a prior.
-        method: a method's name, or "auto", as for `zakai.filter`. Of several states "auto" may take another method when the first
-            interval is known; an estimate at the model's start itself is then by the method before.
+        method: a method's name, or "auto", as for `zakai.filter`. Of several states "auto" may take another method as long as the
+            first eight intervals become known, and filters the observations again; earlier estimates are by the method before.
         inputs: the known inputs of the model that are known before; `update` takes later ones.
         unit: the model's unit of time, where times are dates, as for `zakai.Record`.
         origin: the date at which t = 0, with `unit`.
@@ -65,6 +66,14 @@ def online(
     if (unit is None) != (origin is None):
         raise InputError("online: give both the unit of the model's time and the origin, the date at which t = 0, or none")
     return Online(model, method, options, None if unit is None else Clock.of(origin, unit, "online"), inputs)
+
+
+class Early(NamedTuple):
+    """An observation while the method may still change: its time, its values, and the inputs that were known then."""
+
+    time: float
+    values: list[float]
+    inputs: Inputs | None
 
 
 class Online:
@@ -86,15 +95,16 @@ class Online:
         check_noise_at(model, [model.start])
         self.feeds = tuple(Feed(setting) for setting in self.plan.settings)
         self.lock = RLock()
-        # "auto" asks for the first interval, which is not known yet; until then what is observed at the start is kept.
+        # "auto" asks for the first intervals, which are not known yet; until then what is observed is kept.
         self.undecided = method == "auto" and any(asked(feed.setting) for feed in self.feeds)
-        self.at_start: list[list[float]] = []
+        self.early: list[Early] = []
+        self.first: FirstIntervals | None = None  # by which the method was taken
+        self.given: Inputs | None = None
         if inputs is not None:
             given = expected_inputs(inputs, "online: inputs").on(clock)
             given.check(model, max(self.time, float(given.times[0])), self.time, name="online: inputs")
-            for feed in self.feeds:
-                if feed.setting.model.inputs:
-                    feed.now = feed.now._replace(inputs=given.since(self.time))
+            self.given = given.since(self.time)
+            _start(self.feeds, self.given)
 
     def __repr__(self) -> str:
         return f"Online({self.method} of {self.model.source}, at t = {self.time:.12g})"
@@ -141,12 +151,13 @@ class Online:
         with self.lock:
             time = self._time(time)
             known = self._known("update", time, inputs) if self.model.inputs or inputs is not None else None
-            if self.undecided and time > self.time:
-                self._take(planned(self.model, None, "auto", self.options, unfit=FirstInterval(time, known).fault))
-                self.undecided = False
-            moments = self._moved(time, values, known)
-            if self.undecided:
-                self.at_start.append(values)
+            if not self.undecided:
+                return Estimate(self, self._moved(time, values, known))
+            early = [*self.early, Early(time, values, known)]
+            self._choose(early)
+            moments, self.early = self._moved(time, values, known), early
+            if len({one.time for one in early if one.time > self.model.start}) >= INTERVALS:
+                self.undecided, self.early = False, []
         return Estimate(self, moments)
 
     def _moved(self, time: float, values: list[float], known: Inputs | None) -> tuple[Moment, ...]:
@@ -171,17 +182,26 @@ class Online:
 
         return planned(self.model, None, "auto", self.options, unfit=fault)
 
-    def _take(self, plan: Plan) -> None:
-        """Take another plan at the model's start, where it has other methods."""
-        if plan.method == self.method:
+    def _choose(self, early: Sequence[Early]) -> None:
+        """Choose by the first intervals, of which the last one begins now; another method filters what has been observed."""
+        known = None
+        for one in early:
+            known = one.inputs if known is None or one.inputs is None else known.followed_by(one.inputs)
+        first = FirstIntervals.of(self.model, [one.time for one in early], known)
+        if self.first is not None and first[:2] == self.first[:2]:
             return
-        known = next((feed.now.inputs for feed in self.feeds if feed.setting.model.inputs), None)
-        self.plan, self.feeds = plan, tuple(Feed(setting) for setting in plan.settings)
-        for feed in self.feeds:
-            if feed.setting.model.inputs:
-                feed.now = feed.now._replace(inputs=known)
-        for values in self.at_start:
-            self._moved(self.time, values, known)
+        plan = planned(self.model, None, "auto", self.options, unfit=first.fault)
+        if plan.method != self.method:
+            before, feeds = (self.plan, self.feeds), tuple(Feed(setting) for setting in plan.settings)
+            _start(feeds, self.given)
+            self.plan, self.feeds = plan, feeds
+            try:
+                for one in early[:-1]:
+                    self._moved(*one)
+            except InputError:
+                self.plan, self.feeds = before
+                raise
+        self.first = first
 
     def predict(self, time: float, inputs: Any = None) -> Estimate:
         """Return the estimate at a later time, or now, if nothing is observed until then; the filter stays as it was.
@@ -215,7 +235,7 @@ class Online:
         arrays = {f"{i}/{k}": array for i, (_, own) in enumerate(parts) for k, array in enumerate(own)}
         about = {**self._bound, "filters": [said for said, _ in parts], "more": dict(more or {})}
         about["methods"] = [feed.setting.method.name for feed in self.feeds]
-        about["at_start"] = [[None if one != one else one for one in values] for values in self.at_start]
+        about["early"] = [_stored(one) for one in self.early] if self.undecided else None
         write_checkpoint(path, about, arrays)
 
     def restore(self, path: str | os.PathLike[str]) -> dict[str, Any]:
@@ -229,7 +249,7 @@ class Online:
         about, arrays = read_checkpoint(path)
         if wrong := other_versions(about.get("versions")):
             raise InputError(f"{shown(path)}: was written with another version of {wrong}; name another file, or remove it")
-        plan, feeds, at_start = self.plan, self.feeds, list[list[float]]()
+        plan, feeds = self.plan, self.feeds
         if self.undecided and about.get("method") != plan.method:
             plan = self._with_methods(about.get("methods"))
             feeds = tuple(Feed(setting) for setting in plan.settings)
@@ -243,18 +263,29 @@ class Online:
             if not isinstance(more, dict) or sum(map(len, own_arrays)) != len(arrays):
                 raise ValueError
             with self.lock:
-                at_start = [self._values(values) for values in about["at_start"]]
+                early = None if about["early"] is None else self._read(about["early"])
                 every = zip(feeds, filters, own_arrays, strict=True)
                 moments = [restored(feed, said, own) for feed, said, own in every]
-                if len({moment.time for moment in moments}) != 1:
+                if {moment.time for moment in moments} != ({early[-1].time} if early else {moments[0].time}):
                     raise ValueError
                 for feed, moment in zip(feeds, moments, strict=True):
                     feed.now = moment
-                self.plan, self.feeds, self.at_start = plan, feeds, at_start
-                self.undecided = self.undecided and not self.time > float(self.model.start)
+                self.plan, self.feeds, self.early, self.first = plan, feeds, early or [], None
+                self.undecided = early is not None
         except (KeyError, TypeError, ValueError):
             raise InputError(f"{shown(path)}: the checkpoint does not fit this filter; remove it to start again") from None
         return more
+
+    def _read(self, stored: list[Any]) -> list[Early]:
+        """Return what a checkpoint has kept of the first observations."""
+        early = []
+        for time, values, inputs in stored:
+            if (inputs is None) == bool(self.model.inputs):
+                raise ValueError
+            early.append(Early(_number(time), self._values(values), None if inputs is None else Inputs(*inputs)))
+        if any(later.time < one.time for one, later in pairwise(early)):
+            raise ValueError
+        return early
 
     @property
     def _bound(self) -> dict[str, Any]:
@@ -322,6 +353,19 @@ class Online:
                     f"update: observation {index + 1} is {_short(one)}; values must be finite and at most {LARGEST:g} in size"
                 )
         return [float(one) for one in values]
+
+
+def _start(feeds: Sequence[Feed], inputs: Inputs | None) -> None:
+    """Give the inputs that are known to filters at the model's start."""
+    for feed in feeds:
+        if feed.setting.model.inputs:
+            feed.now = feed.now._replace(inputs=inputs)
+
+
+def _stored(one: Early) -> list[Any]:
+    """Return an observation as JSON can hold it."""
+    inputs = None if one.inputs is None else [one.inputs.times.tolist(), one.inputs.values.tolist()]
+    return [one.time, [None if value != value else value for value in one.values], inputs]
 
 
 def _count(arrays: Mapping[str, Any], index: int) -> int:

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from zakai import _display
 from zakai._progress import Progress
 from zakai.engine.driver import check_model, check_noise, check_records, filter_planned, with_inputs
-from zakai.engine.first_interval import first_interval
+from zakai.engine.first_intervals import first_intervals
 from zakai.engine.plan import plan_of
 from zakai.engine.results import FilterResult
 from zakai.engine.versions import other_versions, versions
@@ -75,7 +75,7 @@ class Prepared:
 
     def __init__(self, model: Model, method: str, options: Mapping[str, Any], record: Record):
         self.model, self.method, self.options, self.record = model, method, dict(options), record
-        self._plan = plan_of(model, model.prior, method, self.options, unfit=first_interval(model, record).fault)
+        self._plan = plan_of(model, model.prior, method, self.options, unfit=first_intervals(model, record).fault)
         check_noise([self._plan], [record])
         for run in self._plan.runs(record, "moments"):
             run.prepare()

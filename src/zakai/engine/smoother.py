@@ -21,7 +21,7 @@ from zakai.densities import Density
 from zakai.engine.batch import filter_all, smooth_all
 from zakai.engine.coarser import Done
 from zakai.engine.driver import check_noise, check_records, with_inputs
-from zakai.engine.first_interval import any_fault, first_interval
+from zakai.engine.first_intervals import any_fault, first_intervals
 from zakai.engine.loop import CHUNK, KEPT_BYTES, Run, advance, size_of
 from zakai.engine.paths import sample_paths
 from zakai.engine.plan import plan_of
@@ -122,7 +122,7 @@ def smooth(
     """
     (record,) = check_records(model, with_inputs(record, inputs))
     with announced(f"{model.source}: deciding which method holds"):
-        plan = plan_of(model, model.prior, method, options, unfit=any_fault(_unfit, first_interval(model, record).fault))
+        plan = plan_of(model, model.prior, method, options, unfit=any_fault(_unfit, first_intervals(model, record).fault))
     check_noise([plan], [record])
     runs = [SmoothingRun(run.setting, run.record) for run in plan.runs(record, "moments")]
     filter_all(runs, progress, len(runs))

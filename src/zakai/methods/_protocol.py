@@ -236,8 +236,8 @@ class Method(Generic[P, S]):
 
     Optional: `backward` is the backward pass of `zakai.smooth`.
 
-    Optional: `bounded(prepared, points)` returns what is prepared with a bound on the work in an interval, in grid points; the
-    health figures of a step that would need more are those of a lost density.  "auto" tries the first interval with it.
+    Optional: `bounded(prepared, points)` returns what is prepared with a bound on the work in an interval, in grid points; a
+    step that needs more raises ExhaustedError.  "auto" tries the first intervals with it.
 
     Optional: `reduced(state)` returns a state of which only the density and the backward pass are asked, without what the next
     step needs: those are the states that a result keeps.

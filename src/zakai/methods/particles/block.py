@@ -23,9 +23,12 @@ import numpy as np
 from zakai.methods.particles.programs import Array
 from zakai.methods.particles.window import MOST, Target, Window, joined
 from zakai.numerics.particles.even import Even
+from zakai.numerics.particles.population import effective, normalised
 
-# On Lorenz-96 with eight states, two of them unseen, the log-likelihood has the deviation 0.83 without and 0.3 to 0.5 with eight.
+# On Lorenz-96 with eight states, two of them unseen, and 2,000 particles the log-likelihood has the deviation 1.8 without blocks,
+# and 0.45 with eight intervals.
 LONGEST = 8
+TRIED, FEW = 16, 128  # what is expensive is tried on one particle in so many, where these are as many at least
 _KEEP = (1.0, 1.0, 0.0, 0.0, 0.0)  # power, change, no sweeps, rho, share of plain noise: weights of the noise as it is
 
 
@@ -45,16 +48,20 @@ class Block(NamedTuple):
     earlier: Array
 
 
-def drawn_again(window: Window, weights: Array, target: Target, share: float, even: Even) -> Block | None:
-    """Return particles whose noise in the last intervals is drawn again, None where that is not possible.
+def drawn_again(window: Window, logs: Array, target: Target, share: float, even: Even, least: float) -> Block | None:
+    """Return particles whose noise in the last intervals is drawn again, None where that leaves too few of them.
+
+    That is tried on one particle in `TRIED`.
 
     Args:
         window: their past, before the new interval.
-        weights: of the particles (N,).
+        logs: log weights of the particles (N,).
         target: the law of the noise of the new interval.
         share: of plain noise in q_k.
         even: what makes normal numbers.
+        least: effective share of the particles.
     """
+    weights = np.exp(logs)
     count, width = 0, target.events.width
     while count < min(window.length, LONGEST) and width + len(window.noises[window.length - 1 - count]) <= MOST:
         count += 1
@@ -72,12 +79,24 @@ def drawn_again(window: Window, weights: Array, target: Target, share: float, ev
     before, after = past.gaussian(path, weights, wider=1.0), whole.gaussian(begin, weights)
     if before is None or after is None:
         return None
-    new, ratio = whole.draw(after, share, even)
-    particles, logs = whole.follow(new)
-    _, _, old, _, _ = past.sweep(before, path, _KEEP, even.key)
-    logs += ratio - old
-    logs[~np.isfinite(particles).all(axis=0) | np.isnan(logs)] = -np.inf
-    return Block(count, whole, after, new, particles, logs, -old)
+
+    def drawn(start: Array, path: Array, even: Even) -> tuple[Array, Array, Array, Array]:
+        """Return new noise, the states after it, log weights, and their part of the old noise."""
+        target = replace(whole, start=start)
+        new, ratio = target.draw(after, share, even)
+        particles, logs = target.follow(new)
+        _, _, old, _, _ = replace(past, start=start).sweep(before, path, _KEEP, even.key)
+        logs += ratio - old
+        logs[~np.isfinite(particles).all(axis=0) | np.isnan(logs)] = -np.inf
+        return new, particles, logs, -old
+
+    if len(logs) >= TRIED * FEW and least > 0.0:
+        few = slice(None, None, TRIED)
+        own = even._replace(rank=np.ascontiguousarray(even.rank[few]), bounds=-(-even.bounds // TRIED))
+        found = logs[few] + drawn(np.ascontiguousarray(start[:, few]), np.ascontiguousarray(path[:, few]), own)[2]
+        if not effective(normalised(found)[0]) > least * len(found):
+            return None
+    return Block(count, whole, after, *drawn(start, path, even))
 
 
 def with_block(window: Window, target: Target, count: int, path: Array) -> Window:

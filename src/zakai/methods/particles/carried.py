@@ -29,6 +29,7 @@ from zakai.methods.particles.interval import TIME_ERROR
 from zakai.methods.particles.moments import moments_of
 from zakai.methods.particles.programs import Array
 from zakai.methods.particles.state import Cloud, Prepared, Rule, State
+from zakai.methods.particles.substeps import substeps
 from zakai.methods.particles.system import root
 from zakai.methods.particles.validity import valid as valid_state
 from zakai.numerics.particles.random import normals
@@ -95,7 +96,7 @@ def _work(prepared: Prepared, k: int, done: tuple[State, Info], values: Array) -
     width, total = events.width // max(len(events.rows), 1), 0
     for turn in range(MEASURED):
         control = state.control._replace(trusted=0, interval=state.control.interval + turn)
-        steps, _ = particle_filter.substeps(prepared, prepared.interval(k), values, state._replace(control=control), about)
+        steps, _ = substeps(prepared, prepared.interval(k), values, state._replace(control=control), about)
         total += motion.operations(steps.scheme, width)
     return times * total / MEASURED
 

@@ -19,23 +19,14 @@ from typing import Any
 import numpy as np
 
 from zakai.methods._protocol import Info
+from zakai.methods.particles.block import FEW, TRIED
 from zakai.methods.particles.events import Interval, Observed, with_update
-from zakai.methods.particles.interval import (
-    MOST_SUBSTEPS,
-    MOST_TIME_ERROR,
-    OF_RANDOM_ERROR,
-    PILOTS,
-    TIME_ERROR,
-    Pilots,
-    Scheme,
-    Steps,
-    steps_of,
-)
 from zakai.methods.particles.islands import CAUTION, FEW_ISLANDS, Islands, regression
 from zakai.methods.particles.moments import moments_of
 from zakai.methods.particles.programs import Array
-from zakai.methods.particles.proposals import HOPELESS, TEMPER_BELOW, advanced
-from zakai.methods.particles.state import BEFORE_MOVES, MOVE, PILOT, PRIOR, RESAMPLING, Cloud, Control, Prepared, Rule, State
+from zakai.methods.particles.proposals import HOPELESS, MOST_RESTS, TEMPER_BELOW, advanced
+from zakai.methods.particles.state import BEFORE_MOVES, MOVE, PRIOR, RESAMPLING, Cloud, Control, Prepared, Rule, State
+from zakai.methods.particles.substeps import allowed_error, substeps
 from zakai.methods.particles.window import Window, taken
 from zakai.methods.system.escape_of_states import RARE, check_escape
 from zakai.numerics.particles.even import even_normals
@@ -54,17 +45,10 @@ DOUBTFUL = 16  # resamplings after an interval that left few particles, in which
 # of the last, and in a step its own and as many as the rest of it takes.  (Measured: 30 to 38 ns in a move, 0.3 us and 40 ns a
 # number in a step.)
 MOVE_GAIN, MOVE_WORTH, FORGOTTEN, STEP_WORK, LEAST_RATE = 1.5, 8.0, 0.98, 4.0, 0.3
-TRIED, FEW = 16, 128  # a move is tried on one particle in so many, where these are as many at least
 MOVE_CONTROL = (1.0, 1.2, 4.0, 0.4, 1.0)  # power, change, most sweeps, rho, share
 VARIANCE = 5.0  # that of a mean times N, in variances of the state, that the number of particles is chosen for
 MOST_GROWTH = 4
 REPEATED, NARROWEST = 2.0, 0.02  # excess of the time error at which an interval is repeated, and least narrowing that counts
-# Of the time error: the share of the allowed one below which it holds in so many more intervals; in how many it does at most,
-# twice as many each time, where it was no more than so many times the substeps that were expected; the ratio of errors by length
-# up to which it holds.  It does not where the drift moves the mean by more than a deviation in the interval, and so many times as
-# fast as where it was measured, or where df/dx is so many times as large: the error is of the third order in it, and twice it is
-# within what `SURE` leaves.
-SURE, TRUSTED, MOST_TRUSTED, FORESEEN, LONGER, FASTER, STEEPER = 0.5, 4, 8, 1.3, 4.0, 2.0, 2 ** (1 / 3)
 
 
 def init(prepared: Prepared, prior: Any) -> State:
@@ -118,7 +102,7 @@ def step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[State
 
 FIGURES = (
     "effective_sample_size", "particles", "founders", "largest_weight", "tempering_levels", "acceptance", "time_error",
-    "monte_carlo_error", "log_likelihood_error", "lower_bound", "uncertain_error", "guided", "moved", "linear_states",
+    "monte_carlo_error", "log_likelihood_error", "lower_bound", "uncertain_error", "guided", "moved", "linear_states", "substeps",
 )  # fmt: skip
 
 
@@ -146,10 +130,10 @@ def _step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[Stat
         # Errors are measured in deviations after the observation, by how much the last one, or this one, has narrowed them.
         steps, control = substeps(prepared, interval, values, state, (before.mean, narrow * scale))
         events = with_update(motion.events(interval, steps.scheme, values, before.mean, scale), system, observed)
-        done = advanced(prepared, start, events, observed, number, rank)
+        done = advanced(prepared, start, (events, observed), number, rank, control.rest > 0)
         after = moments_of(system, done.cloud.particles, done.weights)
         found_narrow = _narrowing(after.cov, done.deviations)
-        if last_turn or steps.error * narrow <= REPEATED * _allowed(control, len(weights)) * found_narrow:
+        if last_turn or steps.error * narrow <= REPEATED * allowed_error(control, len(weights)) * found_narrow:
             break
         narrow = found_narrow
     last = (steps.shift, narrow * scale) if steps.measured else (state.last_shift, state.last_scale)
@@ -228,59 +212,17 @@ def _step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[Stat
         "guided": float(done.guided),
         "moved": moved,
         "linear_states": float(system.linear),
+        "substeps": float(steps.scheme.substeps),
     }
     info = Info(done.gained, end.mean[:n], cov, health, np.sqrt(variance + shift**2), float(np.sqrt(evidence)))
+    failed = 0 if done.block > 0 else min(max(2 * control.failed, 1), MOST_RESTS) if done.block else control.failed
+    rest = failed if done.block else max(control.rest - 1, 0)
     control = control._replace(
-        interval=number, narrow=found_narrow, losses=losses, work=work, excess=excess, floor=floor, rate=rate,
+        interval=number, failed=failed, rest=rest, narrow=found_narrow, losses=losses, work=work, excess=excess, floor=floor, rate=rate,
         doubtful_until=until, shifted=shifted, present=present, known=known, remembered=remembered,
         variance=0.8 * control.variance + 0.2 * len(weights) * float(share.mean()),
     )  # fmt: skip
     return State(cloud.particles, cloud.logs, cloud.window, islands, control, shift, *last), info
-
-
-def _allowed(control: Control, count: int) -> float:
-    """Return the error of a mean by the time step, in standard deviations, that an interval may have."""
-    return min(max(OF_RANDOM_ERROR * math.sqrt(control.variance / count), TIME_ERROR), MOST_TIME_ERROR)
-
-
-def substeps(
-    prepared: Prepared, interval: Interval, values: Array, state: State, about: tuple[Array, Array]
-) -> tuple[Steps, Control]:
-    """Return the substeps of an interval, measured where the last measurement does not hold any more, and the controls."""
-    control, (mean, scale), hold = state.control, about, prepared.model.input_hold
-    length = interval.stop - interval.start
-    if length <= 0:
-        return Steps(Scheme(1, 4), np.zeros(len(mean)), 0.0, 0.0), control
-    # The error of an interval is of the third order of its length, and was measured in deviations of that time.
-    jumps, pace = interval.inputs_change(hold), prepared.motion.pace(interval, values, mean, scale)
-    ratio = (length / control.length) ** 3 if control.length and not jumps else np.inf
-    ratio *= max(1.0, float((state.last_scale / scale).max()))
-    allowed = _allowed(control, len(state.log_weights))
-    needed = control.substeps * np.sqrt(control.error * ratio / allowed)
-    guess = max(1, int(np.ceil(needed))) if needed <= MOST_SUBSTEPS else max(1, control.substeps)
-    alike, steepness = pace * length <= 1.0, 0.0
-    if not alike:  # the mean moves to where the error may be another one
-        steepness = prepared.motion.steepness(interval, values, mean, scale)
-        alike = pace <= FASTER * control.pace and steepness <= STEEPER * control.steepness
-    if control.trusted and alike and ratio <= LONGER and guess <= MOST_SUBSTEPS:
-        ratio *= (control.substeps / guess) ** 2
-        error = control.error * ratio
-        known = Steps(Scheme(guess, control.stages), state.last_shift * ratio, error, error, False)
-        return known, control._replace(trusted=control.trusted - 1)
-    key = prepared.key(control.interval + 1, PILOT)
-    chosen = np.empty(PILOTS, np.int32)
-    systematic(np.exp(state.log_weights), uniform_number(key), chosen)
-    pilots = Pilots(taken(state.particles, chosen), mean, scale, int(key[0] >> np.uint64(2)), allowed)
-    found = steps_of(prepared.motion, interval, values, pilots, guess)
-    count, stages = found.scheme
-    expected = count * np.sqrt(found.error / allowed) <= FORESEEN * needed
-    trusted = min(max(1, 2 * control.granted), MOST_TRUSTED) if expected else 0
-    trusted = max(trusted, TRUSTED) if found.surely <= SURE * allowed else trusted
-    trusted = 0 if jumps else trusted  # of other inputs than those that the next interval begins with
-    return found, control._replace(
-        substeps=count, stages=stages, error=found.error, length=length, trusted=trusted, granted=trusted, pace=pace,
-        steepness=steepness,
-    )
 
 
 def _observed(prepared: Prepared, interval: Interval, values: Array) -> Observed:

@@ -24,7 +24,10 @@ from zakai.methods.particles.window import Target, taken
 from zakai.numerics.particles.even import Even
 from zakai.numerics.particles.population import effective, next_power, normalised
 
-GUIDE_BELOW = 0.3  # effective share below which the noise is drawn again from the linearised posterior
+GUIDE_BELOW = 0.3  # effective share below which the noise of an interval, then of the last ones, is drawn again
+# Least ratio of the effective sizes after and before that, and in how many intervals it rests at most where it is in vain, twice
+# as many each time.
+BLOCK_GAIN, MOST_RESTS = 1.5, 16
 TEMPER_BELOW, TEMPER_FLOOR = 0.1, 400  # effective share and number below which powers of the likelihood are taken
 HOPELESS = 0.01  # effective share below which that is done even where the observation says nothing of the last noise
 GUIDE_SHARE, FIRST_SHARE = 0.1, 0.2  # of plain noise in draws from the linearised posterior, of an interval and of the prior
@@ -38,8 +41,8 @@ class Advanced(NamedTuple):
     `weights` (N,) are those of the particles, `gained` is the increment of the log-likelihood, `noise` (D, N) that of the
     interval, `predicted` (n',) the spread of the coordinates before the weights of the observation act, `deviations` (n,)
     those of the states before it, `acceptance` that of moves between powers of the likelihood; the next one is the share of
-    the particles that left every bounded set, and `unseen` says that few particles are left by an observation that says
-    nothing of the noise.
+    the particles that left every bounded set, `unseen` says that few particles are left by an observation that says nothing of
+    the noise, and `block` is 1 where the noise of the last intervals was drawn again, -1 where that was tried in vain.
     """
 
     cloud: Cloud
@@ -53,6 +56,7 @@ class Advanced(NamedTuple):
     acceptance: float = np.nan
     lost: float = 0.0
     unseen: bool = False
+    block: int = 0
 
 
 class Drawn(NamedTuple):
@@ -73,9 +77,13 @@ class Drawn(NamedTuple):
 
 
 def advanced(
-    prepared: Prepared, cloud: Cloud, events: Events, observed: Observed, number: int, rank: Array
+    prepared: Prepared, cloud: Cloud, given: tuple[Events, Observed], number: int, rank: Array, resting: bool
 ) -> Advanced:
-    """Return the particles, with these numbers (N,) within their islands, after an interval and its observation."""
+    """Return the particles, with these numbers (N,) within their islands, after the events of an interval and its observation.
+
+    `resting`: the noise of the last intervals is drawn again only where very few particles are left.
+    """
+    events, observed = given
     system, count = prepared.system, len(cloud.logs)
     single = (np.array([observed.time]), observed.given[None], observed.counted[None])
     target = Target(prepared.motion, events, *single, None, cloud.particles)
@@ -104,13 +112,17 @@ def advanced(
     even = cloud.islands.even(prepared.key(number, GUIDE), rank)
     best = (gaussian and _guided(target, cloud, plain, gaussian, even)) or Drawn(plain, target, first, logs, None)
     size = effective(best.after.weights) if np.isfinite(best.after.gained) else 0.0
-    few = HOPELESS * count if plain.unseen else min(TEMPER_BELOW * count, TEMPER_FLOOR)
-    if size < (few if plain.unseen else TEMPER_BELOW * count) and not moving:
-        block = drawn_again(cloud.window, np.exp(cloud.logs), target, GUIDE_SHARE, even)
+    hopeless = plain.unseen and size < HOPELESS * count
+    below = HOPELESS if plain.unseen else TEMPER_BELOW if resting else GUIDE_BELOW
+    if size < below * count and not moving:
+        least = max(BLOCK_GAIN * size / count, TEMPER_BELOW)
+        block = drawn_again(cloud.window, cloud.logs, target, GUIDE_SHARE, even, 0.0 if hopeless else least)
         drawn = block and _in_block(cloud, plain, block)
-        if drawn and effective(drawn.after.weights) > max(size, TEMPER_BELOW * count):
+        if drawn and effective(drawn.after.weights) > least * count:
             return drawn.after
-        best = drawn if drawn and plain.unseen else best
+        best = drawn if drawn and hopeless else best
+        best = best._replace(after=best.after._replace(block=-1))
+    few = HOPELESS * count if plain.unseen else min(TEMPER_BELOW * count, TEMPER_FLOOR)
     if size >= few or not np.isfinite(best.logs).any() or plain.unseen and not best.intervals:
         return best.after
     return _tempered(prepared, cloud, best, number)
@@ -159,7 +171,7 @@ def _in_block(cloud: Cloud, plain: Advanced, block: Block) -> Drawn | None:
     particles = np.where(np.isfinite(block.logs), block.particles, plain.cloud.particles)
     after = cloud._replace(particles=particles, logs=cloud.logs + block.logs - gained, window=window)
     noise = np.ascontiguousarray(block.path[-len(plain.noise) :])
-    done = plain._replace(cloud=after, weights=weights, gained=gained, noise=noise, guided=True, unseen=False)
+    done = plain._replace(cloud=after, weights=weights, gained=gained, noise=noise, guided=True, unseen=False, block=1)
     return Drawn(done, block.target, block.path, block.logs, block.gaussian, block.intervals, block.earlier)
 
 
@@ -194,4 +206,5 @@ def _tempered(prepared: Prepared, cloud: Cloud, drawn: Drawn, number: int) -> Ad
     noise = np.ascontiguousarray(path[-len(after.noise) :])
     spreads, weights = (after.predicted, after.deviations), np.exp(cloud.logs)
     cloud, guided = cloud._replace(particles=particles, window=window), fixed is not None
-    return Advanced(cloud, weights, gained, noise, *spreads, levels, guided, float(np.mean(rates)), after.lost)
+    done = Advanced(cloud, weights, gained, noise, *spreads, levels, guided, float(np.mean(rates)), after.lost)
+    return done._replace(block=after.block)

@@ -34,7 +34,8 @@ class Control(NamedTuple):
     `losses` the sum of its means and `work` that of steps and moves, `excess` what has added up since the last move beyond
     `floor`, what that has left; `present` is the part of the last step, and of `known` such parts steps have left
     `remembered` to the next ones; `rate` is the acceptance of the last move, `doubtful_until` the number of resamplings until
-    which standard errors are lower bounds, and `shifted` the variance of the log-likelihood by the time step.
+    which standard errors are lower bounds, and `shifted` the variance of the log-likelihood by the time step; `rest` is the
+    number of intervals in which the noise of the last ones is not drawn again, as it was in vain, and `failed` the last such one.
     """
 
     interval: int = 0
@@ -58,6 +59,8 @@ class Control(NamedTuple):
     present: float = 0.0
     known: float = 0.0
     remembered: float = 0.0
+    rest: int = 0
+    failed: int = 0
 
 
 class Cloud(NamedTuple):

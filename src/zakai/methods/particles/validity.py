@@ -17,7 +17,7 @@ def valid(prepared: Prepared, state: State) -> bool:
     shapes = state.particles.shape == (n, count) and state.shift.shape == (prepared.model.n,)
     shapes = shapes and state.last_shift.shape == state.last_scale.shape == (n,)
     control = state.control
-    shapes = shapes and control.stages in (2, 4) and control.interval >= 0 and control.trusted >= 0
+    shapes = shapes and control.stages in (2, 4) and min(control.interval, control.trusted, control.rest, control.failed) >= 0
     return count > 0 and shapes and _window(prepared, state.window, count) and _islands(state.islands, count, prepared.model.n)
 
 

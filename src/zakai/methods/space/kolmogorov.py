@@ -27,10 +27,10 @@ from zakai.models.features import CROSS_NOISE
 from zakai.models.model import Model
 from zakai.numerics.complex_step import is_complex
 from zakai.numerics.prior_grid import mixture_grid
-from zakai.numerics.space.advance import CHECKED, VANISHED, Control, advance
+from zakai.numerics.space.advance import CHECKED, Control, advance
 from zakai.numerics.space.field import NOTHING, Field, Report, positive, spline_error
 from zakai.numerics.space.grid import Grid
-from zakai.numerics.space.step import ExhaustedError, Stepper
+from zakai.numerics.space.step import Stepper
 from zakai.numerics.space.survey import Survey
 from zakai.numerics.space.update import Update, updated
 from zakai.numerics.space.window import MOST, Bounds
@@ -47,7 +47,7 @@ FINER = 2.0  # ratio of the spacings of a grid to those of its splines, where th
 SHARE = 0.2  # of the tolerance, for the error in time of one interval
 LOST = 0.5  # error of a density relative to itself
 KEPT = 0.98  # largest share of an error that an interval is taken to leave
-OF_FIELDS = 10.0  # work of a point where the noise depends on the state, in that of others (measured: 8 to 20)
+OF_FIELDS = 3.0  # work where the noise depends on the state, in that of others (measured: 2 to 9)
 WIDER = 1.1  # growth of the deviations after which the error of a substep is measured again
 
 
@@ -62,8 +62,8 @@ class Increments(NamedTuple):
 class Prepared:
     """A model, a schedule and parameters, with the bounds that follow from the tolerance.
 
-    `lie` tells whether the filter splits an interval at its end only, which has no backward pass.  An interval in which a density
-    would be computed at more than `most_work` grid points loses it.
+    `lie` tells whether the filter splits an interval at its end only, which has no backward pass.  An interval that needs more
+    than `most_work`, in grid points, raises ExhaustedError.
     """
 
     model: Model
@@ -220,10 +220,7 @@ class Prepared:
             stepper = Stepper(observations.dynamics, bounds, self.tolerance, most_work)
             if steppers is not None:
                 steppers.append(stepper)
-            try:
-                result, more, control = advance(stepper, result, start, length, potential, control, allowed / len(parts), least)
-            except ExhaustedError:
-                return result, report.worst(VANISHED), Control(np.inf, 0.0, 0)
+            result, more, control = advance(stepper, result, start, length, potential, control, allowed / len(parts), least)
             if least >= MOST_PANELS:
                 more = more._replace(splitting=max(more.splitting, 1.0))
             if observations.system.state_dependent:  # mass where the noise has no value may be anywhere on the grid

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from zakai.numerics.exhausted import ExhaustedError
 from zakai.numerics.space.field import (
     Field,
     Report,
@@ -41,12 +42,9 @@ SUPPORT = 400  # points that are moved to see where a density goes
 FEW = 64  # points that show how many Runge-Kutta steps a short substep needs
 TRIES = 7
 MARGIN = 0.03  # of the bounds, for a grid of short steps
-STEP_WORK = 0.1  # of a point (measured: 50 ns, and 500 ns for all else)
+STEP_WORK = 0.1  # of a point
+SUBSTEP_WORK = 1e4  # points that take as long as all else in a computation of a density (measured: 1.5 ms, and 150 ns a point)
 MOST_ENLARGED = 8.0  # times its own volume that a grid may need for the noise of a substep
-
-
-class ExhaustedError(Exception):
-    """An interval needs more work than is allowed."""
 
 
 class Substep(NamedTuple):
@@ -63,8 +61,8 @@ class Substep(NamedTuple):
 class Stepper:
     """Substeps of one interval.
 
-    `work` are the grid points at which a density was computed, a Runge-Kutta step of one counted as `STEP_WORK` points.  Before
-    it is more than `most_work` an ExhaustedError is raised.
+    `work` are the grid points at which a density was computed, and `SUBSTEP_WORK` for each computation; a Runge-Kutta step of a
+    point counts as `STEP_WORK` points.  Before it is more than `most_work` an ExhaustedError is raised.
     """
 
     def __init__(self, dynamics: Dynamics, bounds: Bounds, tolerance: float, most_work: float = math.inf):
@@ -173,7 +171,7 @@ class Stepper:
 
         `begun` is their displacement from the end to a time in between.
         """
-        self.work += math.prod(move.target.sizes) * (1.0 + STEP_WORK * move.steps)
+        self.work += SUBSTEP_WORK + math.prod(move.target.sizes) * (1.0 + STEP_WORK * move.steps)
         if self.work > self.most_work:
             raise ExhaustedError
         return after_motion(source, move, self.dynamics, (t0, t1), potential, self.bounds, begun)
