@@ -11,7 +11,6 @@ References:
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -27,11 +26,10 @@ from zakai.methods.particles.programs import Array
 from zakai.methods.particles.proposals import HOPELESS, MOST_RESTS, TEMPER_BELOW, advanced
 from zakai.methods.particles.state import BEFORE_MOVES, MOVE, PRIOR, RESAMPLING, Cloud, Control, Prepared, Rule, State
 from zakai.methods.particles.substeps import allowed_error, substeps
-from zakai.methods.particles.window import Window, taken
+from zakai.methods.particles.window import Window
 from zakai.methods.system.escape_of_states import RARE, check_escape
 from zakai.numerics.particles.even import even_normals
-from zakai.numerics.particles.population import effective, systematic
-from zakai.numerics.particles.random import uniform_number
+from zakai.numerics.particles.population import effective
 
 RESAMPLE_BELOW = 0.5  # effective share of the particles
 DOUBTFUL = 16  # resamplings after an interval that left few particles, in which standard errors are lower bounds
@@ -218,7 +216,8 @@ def _step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[Stat
     failed = 0 if done.block > 0 else min(max(2 * control.failed, 1), MOST_RESTS) if done.block else control.failed
     rest = failed if done.block else max(control.rest - 1, 0)
     control = control._replace(
-        interval=number, failed=failed, rest=rest, narrow=found_narrow, losses=losses, work=work, excess=excess, floor=floor, rate=rate,
+        interval=number, failed=failed, rest=rest,
+        narrow=found_narrow, losses=losses, work=work, excess=excess, floor=floor, rate=rate,
         doubtful_until=until, shifted=shifted, present=present, known=known, remembered=remembered,
         variance=0.8 * control.variance + 0.2 * len(weights) * float(share.mean()),
     )  # fmt: skip
