@@ -154,7 +154,7 @@ def filtered(values: Array, taps: Array, after: Array, scale: Array, narrow: boo
     return 2e-15 + noise / total, lost / top
 
 
-@helper
+@kernel(float64(float64[::1], float64[::1], float64, float64, float64))
 def wrapped(values: Array, inner: Array, shift: float, variance: float, depth: float) -> float:
     """Replace values on the circle by their convolution with a Gaussian of this mean, in spacings; return the rounding error."""
     size, half = values.size, 0.5 / variance

@@ -334,7 +334,7 @@ def weaken(fine: Array, start: int, precision: Array, observed: Array, centre: A
         change: receives the relative difference of another rule, with half of the places.
     """
     m, size, places, count = fine.shape[0], b.size, fine.shape[2], (b.size + 2 * SPLINE_REACH - 1) * NODES_OF_SPACING
-    h, inner, logs, others = np.empty((m, count * places)), np.zeros(count * places), np.zeros(count), np.zeros(count)
+    h, inner = np.empty((m, count * places)), np.zeros(count * places)
     for i in range(m):
         for f in range(count):
             for p in range(places):
@@ -347,21 +347,28 @@ def weaken(fine: Array, start: int, precision: Array, observed: Array, centre: A
             tops[cell] = max(tops[cell], inner[f])
         for f in range(cell * together, (cell + 1) * together):
             inner[f] = np.exp(inner[f] - tops[cell])
-            logs[f // places] += inner[f] / places
-            if places == 1 or f % 2 == 0:  # a jump is where half of the places show it, nearly
-                others[f // places] += inner[f] / max(places // 2, 1)
+    values = inner
+    if places > 1:
+        values = np.zeros(count)
+        for f in range(count * places):
+            values[f // places] += inner[f] / places
     for j in range(size):
-        one, other, top = 0.0, 0.0, max(tops[j + SPLINE_REACH - 1], tops[j + SPLINE_REACH])
+        one, other, half, top = 0.0, 0.0, 0.0, max(tops[j + SPLINE_REACH - 1], tops[j + SPLINE_REACH])
         for cell in range(2 * SPLINE_REACH):
-            here, there = 0.0, 0.0
+            here, there, first = 0.0, 0.0, (j + cell) * NODES_OF_SPACING
             for f in range(NODES_OF_SPACING):
-                here += _VALUES[cell * NODES_OF_SPACING + f] * logs[(j + cell) * NODES_OF_SPACING + f]
-                there += _OTHER[cell * NODES_OF_SPACING + f] * others[(j + cell) * NODES_OF_SPACING + f]
+                here += _VALUES[cell * NODES_OF_SPACING + f] * values[first + f]
+                there += _OTHER[cell * NODES_OF_SPACING + f] * values[first + f]
             scale = np.exp(min(tops[j + cell] - top, 600.0))
             one, other = one + scale * here, other + scale * there
+            if places > 1:
+                for f in range(0, together, 2):
+                    half += scale * _VALUES[cell * NODES_OF_SPACING + f // places] * inner[first * places + f] * 2.0 / places
         change[j] = 1.0
         if 0.0 < one < np.inf:
             b[j], change[j] = top + np.log(one), 1.0 - other / one
+            if places > 1:
+                change[j] += 1.0 - half / one
 
 
 @kernel(float64(_V, _V))
