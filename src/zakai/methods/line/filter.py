@@ -26,7 +26,7 @@ from zakai.methods.line.choice import predicted
 from zakai.methods.line.domain import check_ends, check_escape, on_the_line, variable_of
 from zakai.methods.line.model import system_of
 from zakai.methods.line.parts import parts_of_step, segment_of_parts
-from zakai.methods.line.prepared import NOISE, SHARED, Parts, Prepared, State
+from zakai.methods.line.prepared import SHARED, Parts, Prepared, State
 from zakai.methods.line.report import Report
 from zakai.methods.line.transition import ModalTransition
 from zakai.methods.line.update import (
@@ -47,7 +47,7 @@ from zakai.numerics.arrays import Array, Number
 from zakai.numerics.line import window as lw
 from zakai.numerics.line.density import separated
 from zakai.numerics.line.product import General, Likelihood, Product, multiplied
-from zakai.numerics.line.resolution import noise_bound
+from zakai.numerics.line.resolution import NOISE, noise_bound
 from zakai.records.schedule import Schedule
 
 SLOW = 1e-2  # of the tolerance: the spectrum that need not be resolved where f has kinks

@@ -31,7 +31,7 @@ from zakai.methods.line.coefficients import (
     tables,
 )
 from zakai.methods.line.modal import coarsened
-from zakai.methods.line.prepared import NOISE, Prepared, TimeInterval
+from zakai.methods.line.prepared import Prepared, TimeInterval
 from zakai.methods.line.report import Report
 from zakai.methods.line.update import refitted
 from zakai.numerics.arrays import Array, Number
@@ -43,6 +43,7 @@ from zakai.numerics.line.resolution import (
     GROSS,
     LOST_ALIASING,
     LOST_MASS,
+    NOISE,
     SPECTRUM_FACTOR,
     TRANSITION_SHARE,
     edge_bound,
