@@ -9,7 +9,7 @@ from zakai.methods.line.report import Report
 from zakai.methods.line.transition import Prediction
 from zakai.numerics.arrays import Array
 from zakai.numerics.line import window as lw
-from zakai.numerics.line.gaussian_kernels import Channel, applied, around, chosen
+from zakai.numerics.line.gaussian_kernels import WIDE, Channel, applied, around, chosen, wrapped
 from zakai.numerics.line.resolution import noise_bound
 
 NARROWEST_KERNEL = 1.4  # spacings that the standard deviation of a kernel must have
@@ -19,19 +19,43 @@ MOST_GRIDS = 13
 def by_kernel(
     prepared: Prepared, values: Array, window: lw.Window, interval: TimeInterval, kernel: Channel, report: Report
 ) -> Prediction | None:
-    """Return the density after an interval, None on the circle, where its kernel is too narrow for the grid, or no grid fits.
+    """Return the density after an interval, None where its kernel is too narrow for the grid or no grid fits.
 
     Args:
         values, window: the density (N,) and its grid.
         kernel: that of the interval, for x relative to the origin of `window`.
         report: receives the figures of the density.
     """
+    arguments = prepared, values, window, kernel
+    prediction = _around(*arguments) if window.closed else _along(*arguments, interval.start, interval.length)
+    if prediction is not None and prediction.check is not None:
+        report.density(prediction.check)
+    return prediction
+
+
+def _around(prepared: Prepared, values: Array, window: lw.Window, kernel: Channel) -> Prediction | None:
+    """Return a density on the circle convolved with a wrapped Gaussian, None where the kernel is none or too narrow."""
+    if np.iscomplexobj(values) or np.iscomplexobj(kernel.variance) or np.iscomplexobj(kernel.shift):
+        return None
+    variance = kernel.variance.real / window.spacing**2
+    if kernel.scale != 1.0 or kernel.slope != 0.0 or kernel.curvature != 0.0 or not variance >= WIDE:
+        return None
+    result = np.array(values, float)
+    wrapped(result, np.empty_like(result), kernel.shift / window.spacing, variance, 8.0 - np.log(prepared.cut))
+    mass = np.sum(result)
+    return Prediction(result / mass, window, np.log(mass) + kernel.constant, lw.grid_check(result, True, prepared.negligible))
+
+
+def _along(
+    prepared: Prepared, values: Array, window: lw.Window, kernel: Channel, start: float, length: float
+) -> Prediction | None:
+    """Return a density on the line after an interval."""
     yau, theta, cut, negligible = prepared.yau, prepared.theta, prepared.cut, prepared.negligible
     width, rough = np.sqrt(np.abs(kernel.variance.real)), noise_bound(prepared.tolerance)
-    if window.closed or yau is None or not width > NARROWEST_KERNEL * window.spacing * abs(kernel.scale.real):
+    if yau is None or not width > NARROWEST_KERNEL * window.spacing * abs(kernel.scale.real):
         return None
     sources = window.offsets
-    logs = np.log(np.where(values.real > 0, values, 0.0)) - yau.potential(window.points, interval.start, theta)
+    logs = np.log(np.where(values.real > 0, values, 0.0)) - yau.potential(window.points, start, theta)
     weights = logs + kernel.constant + sources * (kernel.slope + kernel.curvature * sources)
     top = float(np.max(np.where(np.isfinite(weights.real), weights.real, -np.inf)))
     weights = np.where(np.isfinite(weights.real), np.exp(weights - top), 0.0)
@@ -40,7 +64,7 @@ def by_kernel(
         first = new.centre - new.spacing * (new.size // 2)
         result = applied(sources, first, new.spacing, new.size, weights, kernel.scale, kernel.shift, kernel.variance)
         result = result * new.spacing
-        positive, gauge = result.real > 0, yau.potential(new.points, interval.start + interval.length, theta)
+        positive, gauge = result.real > 0, yau.potential(new.points, start + length, theta)
         logs = np.where(positive, np.log(np.where(positive, result, 1.0)) + gauge, -np.inf)
         best = float(np.max(logs.real))
         result = np.exp(logs - best) if np.isfinite(best) else np.zeros_like(result)
@@ -50,7 +74,6 @@ def by_kernel(
             coarse = check.unresolved(negligible, rough)
         if not (left or right or coarse):
             mass = np.sum(result)
-            report.density(check)
             return Prediction(result / mass, new, np.log(mass) + top + best, check)
         if trial == 0:
             larger = _reached(values, window, kernel, float(width), cut, negligible)
