@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from fractions import Fraction
+
 import numpy as np
 import pytest
 from scipy.linalg import expm
+from scipy.signal import fftconvolve
 from tests.references.graded import posterior
 
 import zakai
@@ -208,6 +211,33 @@ def test_a_jump_of_the_drift_where_the_sensor_jumps_is_one():
 
     one, other = filtered(0), filtered(1e-5)
     assert np.isfinite(one.mean).all() and np.abs(one.mean - other.mean).max() < 1e-4
+
+
+@pytest.mark.parametrize(("step", "noise"), [("1/20", 1e-2), ("1/200", 1e-5)])
+def test_a_finely_quantised_sensor_is_accurate_and_its_error_is_in_the_estimate(step, noise):
+    """Where a prior spans hundreds of jumps of a sensor, these act as averages over the spacing of the grid."""
+    model = zakai.Model(
+        state=["x"], drift=["-x"], observation=[f"{step}*floor(x/({step}))"], observation_noise=[[noise]],
+        observation_kind="samples", prior={"kind": "gaussian", "mean": [0.0], "cov": [[1.0]]},
+    )  # fmt: skip
+    _, record = zakai.simulate(model, TIMES, seed=1)
+    result = zakai.filter(model, record, "yau-yau")
+    q = float(Fraction(step))
+    h = min(q / 16.0, 1.0 / 1600.0)
+    faces = h * np.arange(round(-6.0 / h), round(6.0 / h) + 1)
+    x = faces[:-1] + 0.5 * h
+    p, last = np.exp(-0.5 * x**2), 0.0
+    for k, (time, value) in enumerate(zip(TIMES, record.values[:, 0], strict=True), 1):
+        decay, last = np.exp(last - time), time
+        sums = np.append(0.0, np.cumsum(p) / np.sum(p))
+        kernel = np.exp(-(faces**2) / (1.0 - decay**2))
+        p = fftconvolve(np.diff(np.interp(faces / decay, faces, sums)), kernel, mode="same")
+        p = np.maximum(p, 0.0) * np.exp(-0.5 * (value - q * np.floor(x / q)) ** 2 / noise)
+        p = p / np.sum(p)
+        deviation = np.sqrt((x - x @ p) ** 2 @ p)
+        error = abs(result.mean[k, 0] - x @ p) / deviation
+        assert error < min(2e-4, result.health["error_estimate"][k])
+        assert abs(np.sqrt(result.variance[k, 0]) / deviation - 1.0) < 1e-3
 
 
 @pytest.mark.parametrize("kind", ["samples", "increments"])

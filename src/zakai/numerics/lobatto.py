@@ -99,7 +99,7 @@ class Element(NamedTuple):
     @property
     def halves(self) -> Array:
         """Half the lengths of the intervals (P,)."""
-        return 0.5 * np.diff([self.lower, *self.cuts, self.upper])
+        return _geometry(self)[0]
 
     @property
     def spacing(self) -> float:
@@ -109,14 +109,7 @@ class Element(NamedTuple):
     @property
     def points(self) -> Array:
         """The points (N,), of which the first and the last are the ends; those at cuts lie beside them."""
-        x = rule(self.size).points
-        tiny = max(_BESIDE * (self.upper - self.lower), 4.0 * float(np.spacing(max(abs(self.lower), abs(self.upper)))))
-        low, high = (np.array(ends) for ends in ([self.lower, *self.cuts], [*self.cuts, self.upper]))
-        half = self.halves[:, None]
-        result = np.where(x < 0, low[:, None] + half * (1.0 + x), high[:, None] - half * (1.0 - x))
-        result[1:, 0] += tiny
-        result[:-1, -1] -= tiny
-        return np.asarray(result.reshape(-1))
+        return _geometry(self)[1]
 
     @property
     def offsets(self) -> Array:
@@ -126,7 +119,7 @@ class Element(NamedTuple):
     @property
     def weights(self) -> Array:
         """The weights (N,) of the quadrature."""
-        return np.asarray((self.halves[:, None] * rule(self.size).weights).reshape(-1))
+        return _geometry(self)[2]
 
     def symmetric(self, covariance: Array, slope: Array, joined: Array) -> Array:
         """Return -L (N - C, N - C) as a symmetric operator, for G (N,) and s'/s (N,).
@@ -183,3 +176,19 @@ class Element(NamedTuple):
         """Return the largest Legendre coefficient in the highest eighth, relative to the largest of all."""
         coefficients = np.abs((values / self.weights).real.reshape(-1, self.size) @ rule(self.size).analysis.T)
         return float(coefficients[:, -max(3, self.size // 8) :].max() / coefficients.max())
+
+
+@lru_cache(maxsize=256)
+def _geometry(element: Element) -> tuple[Array, Array, Array]:
+    """Return half the lengths of the intervals of an element, its points and its weights."""
+    lower, upper, size, cuts = element
+    halves, x = 0.5 * np.diff([lower, *cuts, upper])[:, None], rule(size).points
+    tiny = max(_BESIDE * (upper - lower), 4.0 * float(np.spacing(max(abs(lower), abs(upper)))))
+    low, high = (np.array(ends)[:, None] for ends in ([lower, *cuts], [*cuts, upper]))
+    points = np.where(x < 0, low + halves * (1.0 + x), high - halves * (1.0 - x))
+    points[1:, 0] += tiny
+    points[:-1, -1] -= tiny
+    result = halves[:, 0], points.reshape(-1), (halves * rule(size).weights).reshape(-1)
+    for array in result[:2]:  # kernels take the weights
+        array.setflags(write=False)
+    return result

@@ -28,8 +28,7 @@ from zakai.methods.line.update import acting_inside, factor_of, state_moments
 from zakai.numerics.arrays import Array
 from zakai.numerics.line import window as lw
 from zakai.numerics.line.density import support
-
-KINKED = 16.0  # points of a likelihood with kinks in the spacing that a message needs
+from zakai.numerics.line.product import NODES_OF_SPACING
 
 
 def last_message(prepared: Prepared, state: State) -> Message:
@@ -138,7 +137,7 @@ def _smoothed(prepared: Prepared, state: State, message: Message, result: _Produ
 def step(prepared: Prepared, k: int, message: Message, observed: np.ndarray, state: State) -> Message:
     """Return the message at the start of interval k from that at its end; `state` is the filter's at the start."""
     length = float(prepared.lengths[k])
-    finer = KINKED if prepared.weak and prepared.schedule.seen[k].any() else 1.0
+    finer = NODES_OF_SPACING if prepared.weak and prepared.schedule.seen[k].any() else 1.0
     message = message.on(points_of(message.window, *message.ends, message.needed / finer)).between(*message.ends)
     before = message.variance
     inside, likelihood = acting_inside(prepared, k), factor_of(prepared, k, observed, message.window)

@@ -1,9 +1,7 @@
 """A message of one state over one interval, backward in time, where the compiled loop refuses it.
 
 A Gaussian kernel is a sum over a grid.  On the circle the transposed exponentials of the filter act, on the line a grid that
-moves (`line/gauged.py`) where the drift carries the density.  Else, where no coefficient depends on t and no increments act
-within, a grid covers the support of the message at the end of the interval, that of the density at its start, and the paths
-between them; psi is moved by its decomposition.  Other intervals are for finite volumes (`line/volumes.py`).
+moves (`line/gauged.py`) where the drift carries the density, and else finite volumes (`line/volumes.py`).
 """
 
 from __future__ import annotations
@@ -14,17 +12,16 @@ from zakai.methods.line.coefficients import covariance_at, resolved_parts, trave
 from zakai.methods.line.domain import ends_of_leak
 from zakai.methods.line.gauged import by_moving_grid
 from zakai.methods.line.kernel import kernel_of
-from zakai.methods.line.message import Message, covering, gauged, points_of, reliable, taper
+from zakai.methods.line.message import Message, points_of, reliable
 from zakai.methods.line.prepared import Prepared, State, TimeInterval
 from zakai.methods.line.report import Report
 from zakai.methods.line.transition import MOST_SUBSTEPS, Substep, parts_of_split, trial_substep
 from zakai.methods.line.volumes import WIDENINGS, cell_plan_of, ends_of, pulled_back
 from zakai.numerics.arrays import Array
 from zakai.numerics.line import window as lw
-from zakai.numerics.line.backward import EXCURSION, FEWEST, SMALLEST
+from zakai.numerics.line.backward import FEWEST, SMALLEST
 from zakai.numerics.line.density import support
-from zakai.numerics.line.resolution import ROUNDING, SMOOTHER_SHARE, SPECTRUM_FACTOR, TRIALS
-from zakai.numerics.line.window import local_polynomial
+from zakai.numerics.line.resolution import TRIALS
 
 
 def by_exponentials(
@@ -33,7 +30,7 @@ def by_exponentials(
     """Return what `pulled` returns, by transposed exponentials; None where they do not serve.  Less than `accepted` is none."""
     spacing = message.needed
     for _ in range(TRIALS):
-        window = covering(message.window, 0.0, 0.0, min(spacing, state.spacing))
+        window = points_of(message.window, *message.ends, min(spacing, state.spacing))
         values = np.exp(message.at(window.offsets) - np.max(message.logs))
         values, top, error = _transposed(prepared, values, window, interval)
         check = lw.grid_check(values, True, accepted)
@@ -104,19 +101,12 @@ def pulled(prepared: Prepared, interval: TimeInterval, state: State, message: Me
         if dense is not None:
             return dense
     leak = ends_of_leak(prepared, own, np.array(ends), interval.start, interval.length)
-    if leak is not None:  # a grid loses mass at a natural end, in both directions of time
-        result = _by_volumes(prepared, interval, state, ends, message, leak)
-        if result[1] <= smoothing_tolerance(prepared):
-            return result
     dense = None
-    if travel(prepared, np.asarray(state.values), own, interval.start, interval.length) > 0.0:
+    if leak is None and travel(prepared, np.asarray(state.values), own, interval.start, interval.length) > 0.0:
         dense = by_moving_grid(prepared, interval, state, message, accepted)
         if dense is not None and dense[1] <= smoothing_tolerance(prepared):
             return dense
-    result = _by_modes(prepared, interval, state, ends, message)
-    if result is not None:
-        return result
-    result = _by_volumes(prepared, interval, state, ends, message)
+    result = _by_volumes(prepared, interval, state, ends, message, leak)
     return dense if dense is not None and dense[1] < result[1] else result
 
 
@@ -146,78 +136,9 @@ def _by_kernel(
     return Message.of(result, new, new.spacing, message.error), report.time
 
 
-def _by_modes(
-    prepared: Prepared, interval: TimeInterval, state: State, ends: tuple[float, float], message: Message
-) -> tuple[Message, float] | None:
-    """Return the same by a decomposition, None where there is none or rounding in psi counts."""
-    if prepared.system.varying or prepared.system.rough or interval.inside.any():
-        return None
-    length, accepted = interval.length, max(negligible(prepared), SPECTRUM_FACTOR * prepared.negligible)
-    low, high = min(message.ends[0], ends[0]), max(message.ends[1], ends[1])
-    least, most = _noise(prepared, interval.k, state.origin + low, state.origin + high)
-    low, high = low - EXCURSION * most, high + EXCURSION * most  # paths from one support to the other leave both
-    spacing = max(message.needed, SPACING_OF_NOISE * least)
-    for trial in range(TRIALS):
-        window = covering(message.window, low, high, spacing)
-        if window.size > lw.LARGE:
-            return None
-        operator = gauged(prepared, window)
-        if operator is None:
-            return None
-        psi, top = _psi(message, window, operator.logs)
-        propagated, growth = operator.decayed(psi, length), max(1.0, float(np.exp(-length * operator.rates[0])))
-        highest = float(np.max(propagated))
-        if not 0.0 < highest < np.inf:
-            return None
-        error = ROUNDING * float(np.sqrt(np.sum(psi * psi))) * growth / highest
-        if not _exact(prepared, state, propagated, operator.logs, window, error):
-            return None
-        check = lw.grid_check(propagated, False, accepted)
-        coarse = check.aliasing > accepted and not (check.rough and check.aliasing < 1e-3 * prepared.tolerance)
-        if not coarse or window.size >= lw.LARGEST or (check.rough and trial > 1):
-            break
-        spacing = window.spacing / 1.5
-    made = error + 2.0 * check.aliasing + 10.0 * max(check.left, check.right)
-    if made > smoothing_tolerance(prepared):
-        return None
-    assert operator is not None
-    logs = np.log(np.maximum(propagated, SMALLEST * highest) / window.spacing) - operator.logs + top
-    needed = window.spacing * float(np.clip(check.resolving, 1.0, 2.0))
-    return Message.of(logs, window, needed, message.error).between(*ends), made
-
-
-def _psi(message: Message, window: lw.Window, gauge: Array) -> tuple[Array, float]:
-    """Return the values of psi on a grid times its spacing, divided by the exponential of the second number."""
-    finer = window.spacing > 1.01 * message.spacing
-    fine = covering(message.window, *message.ends, message.spacing) if finer else window
-    logs = message.falling(fine.offsets) + (local_polynomial(gauge, window, fine.offsets) if finer else gauge)
-    top = float(np.max(logs))
-    values = fine.spacing * np.exp(logs - top) * taper(fine.offsets, message.ends, fine.spacing)
-    # Integrals of psi with what the coarse grid resolves.
-    return lw.gathered(values, fine.offsets, window) if finer else values, top
-
-
-def _exact(prepared: Prepared, state: State, psi: Array, gauge: Array, window: lw.Window, error: float) -> bool:
-    """Return whether the error of psi, relative to its maximum, is small in the product with the density at the start."""
-    own, top = state.window, float(np.max(psi))
-    if own.spacing < window.spacing:  # of which the grid may have no point
-        density = reliable(state, own)
-        density, offsets = density[density > 0.0], own.offsets[density > 0.0]
-        log_gauge = local_polynomial(gauge, window, offsets)
-        log_psi = local_polynomial(np.log(np.maximum(psi, SMALLEST * top) / top), window, offsets)
-    else:
-        density = reliable(state, window)
-        inside = density > 0.0
-        density, log_gauge, log_psi = density[inside], gauge[inside], np.log(np.maximum(psi[inside], 0.0) / top)
-    logs, product = np.log(density) - log_gauge, np.log(density) - log_gauge + log_psi
-    shift = np.max(product)
-    allowed = SMOOTHER_SHARE * smoothing_tolerance(prepared)
-    return bool(max(error, SMALLEST) * np.sum(np.exp(logs - shift)) < allowed * np.sum(np.exp(product - shift)))
-
-
 def _by_volumes(
     prepared: Prepared, interval: TimeInterval, state: State, ends: tuple[float, float], message: Message,
-    leak: Array | None = None,
+    leak: Array | None,
 ) -> tuple[Message, float]:  # fmt: skip
     """Return the same by finite volumes, of infinite error where they do not serve; with a leak they reach its ends."""
     values, window = np.asarray(state.values).real, state.window

@@ -24,7 +24,7 @@ from zakai.numerics.line import window as lw
 from zakai.numerics.line.averages import GAUSS_NODES, GAUSS_WEIGHTS, Panels, panels
 from zakai.numerics.line.grid_choice import PER, PROFILE, REACH
 from zakai.numerics.line.operator import Spectral, symmetric
-from zakai.numerics.line.product import NODES_OF_SPACING, at_nodes, nodes, weak
+from zakai.numerics.line.product import NODES_OF_SPACING, at_nodes, nodes, places_of_nodes, weak
 
 _MIDPOINTS = (np.arange(32) + 0.5) / 32.0 - 0.5
 
@@ -55,6 +55,13 @@ def spectral(prepared: Prepared, window: lw.Window) -> Spectral | None:
     """Return the decomposition of the operator on a grid, if it has one."""
     result: tuple[Spectral | None] = prepared.once(Derived.MODES, window, lambda: (decomposed(prepared, window, lw.LARGEST),))
     return result[0]
+
+
+def sensor_at_nodes(prepared: Prepared, points: Array, spacing: float) -> Array:
+    """Return an h with kinks or jumps (m, F, P) at the places of the nodes of a grid."""
+    system, start = prepared.system, prepared.model.start
+    values = system.observation(nodes(points, spacing)[:, None], start, prepared.theta).T
+    return places_of_nodes(values, system.jumping_observation)
 
 
 def profile_of(prepared: Prepared, window: lw.Window) -> Array:

@@ -39,7 +39,7 @@ from zakai.models.model import Model
 from zakai.models.numeric import numpy_function
 from zakai.numerics.arrays import Array
 from zakai.numerics.line import window as lw
-from zakai.numerics.line.resolution import EDGE, SUPPORT, TRANSITION_SHARE
+from zakai.numerics.line.resolution import RESOLVED, SUPPORT, TRANSITION_SHARE
 
 # attributes that a model computes from its formulas
 _DERIVED = ("text", "observation_law", "covariance", "features", "depends_on_time", "_kept")
@@ -177,9 +177,9 @@ def ends_of_leak(prepared: Prepared, window: lw.Window, ends: Array, start: floa
             continue
         grows = float(np.log(noise[2] / noise[1]) / (FAR_DISTANCES[1] - FAR_DISTANCES[0]))  # 2 - k
         inward = max(float(-2.0 * side * drift[1] / noise[1]), 0.0)  # kappa - 1
-        if grows > NOISE_GROWS and EDGE ** (inward / (inward + grows)) > TRANSITION_SHARE * prepared.tolerance:
+        if grows > NOISE_GROWS and RESOLVED ** (inward / (inward + grows)) > TRANSITION_SHARE * prepared.tolerance:
             leaking = True
-            result[i] += side * -np.log(EDGE) / (inward + grows)
+            result[i] += side * -np.log(RESOLVED) / (inward + grows)
     return result if leaking else None
 
 

@@ -26,9 +26,9 @@ from zakai.methods.line.choice import predicted
 from zakai.methods.line.domain import check_ends, check_escape, on_the_line, variable_of
 from zakai.methods.line.model import system_of
 from zakai.methods.line.parts import parts_of_step, segment_of_parts
-from zakai.methods.line.prepared import NOISE, SHARED, Parts, Prepared, State
+from zakai.methods.line.prepared import SHARED, Parts, Prepared, State
 from zakai.methods.line.report import Report
-from zakai.methods.line.transition import RecordedTransition
+from zakai.methods.line.transition import ModalTransition
 from zakai.methods.line.update import (
     acting_inside,
     edge_of_moments,
@@ -47,7 +47,7 @@ from zakai.numerics.arrays import Array, Number
 from zakai.numerics.line import window as lw
 from zakai.numerics.line.density import separated
 from zakai.numerics.line.product import General, Likelihood, Product, multiplied
-from zakai.numerics.line.resolution import noise_bound
+from zakai.numerics.line.resolution import NOISE, noise_bound
 from zakai.records.schedule import Schedule
 
 SLOW = 1e-2  # of the tolerance: the spectrum that need not be resolved where f has kinks
@@ -105,13 +105,13 @@ def segment(prepared: Prepared, rows: slice, state: State, observed: np.ndarray)
 class SingleStep(NamedTuple):
     """The state after an interval that the compiled loop does not take, its report, and how the density came about.
 
-    That is how its transition moved it, where that is known; the density after the observation on its own grid; and the parts of
-    the interval, if it was cut.
+    That is its transition, where it is modal; the density after the observation on its own grid; and the parts of the interval,
+    if it was cut.
     """
 
     state: State
     info: Info
-    transitions: tuple[RecordedTransition, ...]
+    transition: ModalTransition | None
     values: np.ndarray
     window: lw.Window
     parts: Parts | None = None
@@ -165,14 +165,14 @@ def single(prepared: Prepared, k: int, state: State, observed: np.ndarray) -> Si
     parts = parts_of_step(prepared, k, values, window)
     if parts is not None:
         state, info = _of_parts(parts, 0, state, observed)
-        return SingleStep(state, info, (), np.asarray(state.values), state.window, parts)
-    transitions: tuple[RecordedTransition, ...] = ()
+        return SingleStep(state, info, None, np.asarray(state.values), state.window, parts)
+    transition: ModalTransition | None = None
     _, before = lw.moments(values, window)  # the variance
     contraction = 1.0
     gained: Number = 0.0
     if length > 0:
         prediction, contraction = predicted(prepared, values, window, prepared.interval(k, inside, observed), report)
-        values, window, gained, check, transitions = prediction
+        values, window, gained, check, transition = prediction
     _, between = lw.moments(values, window)
     log_floor = float(state.log_floor)
     if report.positive:
@@ -212,7 +212,7 @@ def single(prepared: Prepared, k: int, state: State, observed: np.ndarray) -> Si
     mean, variance = state_moments(prepared, values, window, mean, variance)
     log_floor = min(log_floor + max(report.depth - 1.0, 0.0), 0.0)
     info = Info(gained, np.array([mean]), np.array([[variance]]), health)
-    return SingleStep(State.of(new_values, new, error, log_floor), info, transitions, values, window)
+    return SingleStep(State.of(new_values, new, error, log_floor), info, transition, values, window)
 
 
 def _multiplied(

@@ -15,7 +15,7 @@ from zakai.methods._protocol import Info, Infos, joined
 from zakai.methods._states import Joined, StackedStates
 from zakai.methods.line import modal
 from zakai.methods.line.cache import Derived
-from zakai.methods.line.coefficients import misses_drift, on_grid_for_drift
+from zakai.methods.line.coefficients import misses_drift, on_grid_for_drift, sensor_at_nodes
 from zakai.methods.line.prepared import Prepared, State
 from zakai.methods.line.update import edge_of_moments, grid_check, on_fitting_grid, outside_tables, resampled, state_moments
 from zakai.numerics.arrays import Array
@@ -24,7 +24,6 @@ from zakai.numerics.line.averages import GAUSS_NODES, parts_needed, probed
 from zakai.numerics.line.gaussian_kernels import BAND
 from zakai.numerics.line.loop import advance
 from zakai.numerics.line.modes_loop import OWN, PLACE, STAY
-from zakai.numerics.line.product import at_nodes, nodes
 from zakai.numerics.line.resolution import TRIALS
 from zakai.numerics.line.steps import CELL, COLUMNS, DRIFT, OBSERVED, PHI, SLOPE, TABLE_MARGIN, Grid, Segment, Start, Status
 
@@ -72,17 +71,11 @@ def _separated(prepared: Prepared, window: lw.Window, x: np.ndarray) -> np.ndarr
 
 
 def _fine(prepared: Prepared, window: lw.Window, x: np.ndarray) -> np.ndarray:
-    """Return an h with kinks, of samples, at the nodes of points (m, F), else nothing."""
-    system = prepared.system
+    """Return an h with kinks or jumps, of samples, at the nodes of points (m, F, P), else nothing."""
     if not prepared.weak:
-        return _NONE[None]
-
-    def make() -> np.ndarray:
-        points = nodes(x, window.spacing)[:, None]
-        return at_nodes(system.observation(points, prepared.model.start, prepared.theta).T)
-
-    result: np.ndarray = prepared.once(Derived.FINE, (window.origin, window.spacing, float(x[0]), len(x)), make)
-    return result
+        return _NONE[None, None]
+    key = window.origin, window.spacing, float(x[0]), len(x)
+    return prepared.once(Derived.FINE, key, lambda: sensor_at_nodes(prepared, x, window.spacing))
 
 
 def _nodes(window: lw.Window, x: np.ndarray) -> np.ndarray:

@@ -110,23 +110,11 @@ def taper(offsets: Array, ends: tuple[float, float], spacing: float) -> Array:
     return np.asarray(0.5 * erfc((beyond - HALF) / FALL))
 
 
-def covering(window: lw.Window, low: float, high: float, spacing: float) -> lw.Window:
-    """Return the grid of at most this spacing for offsets from `low` to `high` and the fall of F beyond, of any size."""
-    if window.closed:
-        size = lw.size_for(2 * np.pi / spacing * 0.999)
-        return window._replace(size=size, spacing=2 * np.pi / size)
-    spacing = lw.quantized(window, low, high, spacing).spacing
-    # Few different grids: their ends are multiples of an eighth of their size, and decompositions serve many times.
-    apart = spacing * 2.0 ** np.floor(np.log2(max((high - low) / spacing + 2 * PAD, 32.0) / 8.0))
-    first, last = apart * np.floor(low / apart), apart * np.ceil(high / apart)
-    size = int(round((last - first) / spacing)) + 2 * PAD
-    return window._replace(centre=float(0.5 * (first + last)), spacing=spacing, size=size)
-
-
 def points_of(window: lw.Window, low: float, high: float, spacing: float) -> lw.Window:
     """Return the grid of at most this spacing between two offsets, without the fall of F."""
     if window.closed:
-        return covering(window, low, high, spacing)
+        size = lw.size_for(2 * np.pi / spacing * 0.999)
+        return window._replace(size=size, spacing=2 * np.pi / size)
     spacing = lw.quantized(window, low, high, spacing).spacing
     first, last = np.floor(low / spacing + 1e-9), np.ceil(high / spacing - 1e-9)
     size = max(int(last - first) + 1, FEWEST)

@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 
 from zakai.methods.line.cache import CacheKey, Derived
-from zakai.methods.line.coefficients import covariance_at, gauge_at, profile_of, spectral
+from zakai.methods.line.coefficients import covariance_at, gauge_at, profile_of, sensor_at_nodes, spectral
 from zakai.methods.line.prepared import SHARED, Prepared, State
 from zakai.methods.line.update import factor_at_end, grid_check
 from zakai.numerics.arrays import Array
@@ -27,7 +27,7 @@ from zakai.numerics.line import window as lw
 from zakai.numerics.line.density import circular_rows, waves
 from zakai.numerics.line.grid_choice import PER, SPACING, WIDENING, coarse_grid
 from zakai.numerics.line.modes import KnownGrids, Start
-from zakai.numerics.line.product import General, at_nodes, nodes, weaken
+from zakai.numerics.line.product import General, weaken
 from zakai.numerics.line.resolution import TRIALS, edge_bound, rounding_bound, spectrum_bound
 from zakai.numerics.line.steps import COLUMNS, STATUSES, Status
 
@@ -172,14 +172,9 @@ def _rows(prepared: Prepared, k: int, grid: lw.Window, observed: np.ndarray, sta
 
 
 def _weak_rows(prepared: Prepared, k: int, grid: lw.Window, observed: np.ndarray) -> Array:
-    system, start, theta = prepared.system, prepared.model.start, prepared.theta
-
-    def make() -> tuple[Array, Array]:
-        points = nodes(grid.points, grid.spacing)[:, None]
-        fine = at_nodes(system.observation(points, start, theta).T)
-        return fine, np.ascontiguousarray(system.observation(grid.points[grid.size // 2, None][None], start, theta)[0])
-
-    fine, centre = prepared.once(Derived.FINE_OF_GRID, grid, make)
+    fine = prepared.once(Derived.FINE, grid, lambda: sensor_at_nodes(prepared, grid.points, grid.spacing))
+    middle = grid.points[grid.size // 2, None][None]
+    centre = np.ascontiguousarray(prepared.system.observation(middle, prepared.model.start, prepared.theta)[0])
     result, precision = np.full((2, grid.size), [[-1e150], [1.0]]), np.ascontiguousarray(prepared.steps.precisions[k, 0])
     weaken(fine, 0, precision, observed, centre, result[0], result[1])
     result[0] -= 0.5 * (observed - centre) @ precision @ (observed - centre)

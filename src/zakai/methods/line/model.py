@@ -217,8 +217,9 @@ class System:
         # Whether h, or the law of what is observed, has no jump and no kink.
         law = [*without_branch(model), *([] if model.log_density is None else [model.log_density])]
         self.smooth_observation = not any(not _continuous(part, x) or _rough(part, x) for part in law)
-        # Whether h has kinks, but no jump.
-        self.kinked_observation = not self.smooth_observation and all(_continuous(part, x) for part in without_branch(model))
+        # Whether h has kinks, or jumps at which a density is not divided.
+        self.kinked_observation = not self.smooth_observation
+        self.jumping_observation = not all(_continuous(part, x) for part in without_branch(model))
         self.kinked_drift = self.slope is not None and _rough(model.drift[0], x)
         self.rough = any(not _continuous(part, x) or _rough(part, x) for part in (model.drift[0], model.covariance[0]))
         self.moving = bool((model.drift.free_symbols | model.covariance.free_symbols) & given)

@@ -31,7 +31,6 @@ from zakai.numerics.line.steps import FACTOR, KERNEL, SPLIT, SPLIT_FACTOR, Limit
 from zakai.records.schedule import Schedule, lengths_of
 
 T = TypeVar("T")
-NOISE = 3e-15  # error of a density relative to its maximum, which matters in its tails
 KERNEL_SHARE = 2e-2  # of the promised error that the splitting of one interval may leave in `limited-direct`
 SHARE = 5e-3  # of the tolerance that the splitting of one interval may leave
 SHARED = 128  # points of the largest grid on which many steps share a decomposition

@@ -21,14 +21,14 @@ from zakai.methods.line.coefficients import spectral
 from zakai.methods.line.loop import DIVIDED, START, Piece, grid_of, infos_of
 from zakai.methods.line.parts import segment_of_parts
 from zakai.methods.line.prepared import Parts, Prepared, State
-from zakai.methods.line.transition import RecordedTransition, Substep, exponents_of
+from zakai.methods.line.transition import ModalTransition
 from zakai.methods.line.update import factor_of
-from zakai.numerics.arrays import Array, Number
+from zakai.numerics.arrays import Array
 from zakai.numerics.complex_step import STEP
 from zakai.numerics.line import window as lw
 from zakai.numerics.line.splitting import Interval, TangentCoefficients, through
 from zakai.numerics.line.steps import SPLIT
-from zakai.numerics.line.tangents import Varied, exponential_tangents, extended, resampled_tangents
+from zakai.numerics.line.tangents import Varied, extended, resampled_tangents
 
 IN_TIME = "drifts", "outputs", "covariances", "precisions"
 
@@ -74,8 +74,8 @@ class _Walk:
             if isinstance(result, line_filter.SingleStep):
                 if result.parts is not None:
                     self.in_parts(result.parts, slice(0, 1), before, values[:1])
-                elif result.transitions:
-                    self._passed(prepared, k, before, result, values[0])
+                elif result.transition is not None:
+                    self._passed(prepared, k, before, result, result.transition, values[0])
                 else:
                     self._singly(k, before, result.state, values[0])
                 return
@@ -174,37 +174,20 @@ class _Walk:
         length, inside, closed = float(prepared.lengths[k]), bool(prepared.kinds[k] == SPLIT), piece.before.closed
         return Interval(length, piece.before.spacing, closed, observed, inside, int(pairs), int(substeps), bool(needed > 0.0))
 
-    def _passed(self, prepared: Prepared, k: int, before: State, step: line_filter.SingleStep, observed: np.ndarray) -> None:
-        """Take a single step whose transitions are known."""
-        density, own = before.values, before.window
-        gained: Number = 0.0
-        for transition in step.transitions:
-            self._regrid(density, own, transition.window)
-            own = transition.after
-            if transition.substep is None:
-                varied = self._varied(prepared, own)
-                density, propagated = varied.through(
-                    transition.values, self.tangents, transition.length, transition.window, own, transition.margins
-                )
-            else:
-                density, propagated = self._by_exponentials(prepared, transition, transition.substep)
-            self.tangents, gained = propagated / np.exp(transition.log_mass), gained + transition.log_mass + transition.offset
-        self._regrid(density, own, step.window)
+    def _passed(
+        self, prepared: Prepared, k: int, before: State, step: line_filter.SingleStep, transition: ModalTransition,
+        observed: Array,
+    ) -> None:  # fmt: skip
+        """Take a single step whose transition is by modes."""
+        self._regrid(before.values, before.window, transition.window)
+        density, propagated = self._varied(prepared, transition.after).through(
+            transition.values, self.tangents, transition.length, transition.window, transition.after, transition.margins
+        )
+        self.tangents = propagated / np.exp(transition.log_mass)
+        self._regrid(density, transition.after, step.window)
         logs = self._logs(partial(_logs_of, k=k, observed=observed, points=step.window.points), prepared)
-        self._multiply(step.values, logs, step.info.log_likelihood_increment - gained)
+        self._multiply(step.values, logs, step.info.log_likelihood_increment - transition.log_mass)
         self._regrid(step.values, step.window, step.state.window)
-
-    def _by_exponentials(self, prepared: Prepared, transition: RecordedTransition, substep: Substep) -> tuple[Array, Array]:
-        """Return the density after a substep, but for its mass, and the derivatives, which are to be divided by its mass."""
-        values, window = transition.values, transition.window
-        exponents = exponents_of(prepared, values, window, substep)
-        shifted = [exponents_of(one, values, window, substep) for one in self.shifted]
-        tangents = extended(values, self.tangents)
-        for i, generator in enumerate(exponents.generators):
-            changes = [one.generators[i] for one in shifted]
-            values, tangents = exponential_tangents(window, generator, changes, values, tangents)
-        constants = np.array([np.imag(one.constant) for one in shifted]) / STEP
-        return values, tangents + values * constants[:, None]
 
     def _logs(self, function: Callable[[Prepared], Array], prepared: Prepared) -> Array:
         """Return the logarithms (p, ...) of likelihoods, with imaginary parts where a likelihood depends on the parameter."""

@@ -31,7 +31,7 @@ from zakai.methods.line.coefficients import (
     tables,
 )
 from zakai.methods.line.modal import coarsened
-from zakai.methods.line.prepared import NOISE, Prepared, TimeInterval
+from zakai.methods.line.prepared import Prepared, TimeInterval
 from zakai.methods.line.report import Report
 from zakai.methods.line.update import refitted
 from zakai.numerics.arrays import Array, Number
@@ -43,6 +43,7 @@ from zakai.numerics.line.resolution import (
     GROSS,
     LOST_ALIASING,
     LOST_MASS,
+    NOISE,
     SPECTRUM_FACTOR,
     TRANSITION_SHARE,
     edge_bound,
@@ -256,11 +257,10 @@ MOST_SUBSTEPS = 4000
 SUBSTEPS_OF_LARGE_GRID = 24  # substeps of an interval, after which no large grid is used
 
 
-class RecordedTransition(NamedTuple):
-    """A transition: the density and the grid before it, its length, the logarithm of its mass, and the grid after it.
+class ModalTransition(NamedTuple):
+    """A transition by modes: the density and the grid before it, its length, the logarithm of its mass, and the grid after it.
 
-    It is by the modes of that grid, of which at the `margins`, in points, there is no density; or by the exponentials of a
-    `substep`, times exp(-offset).
+    The latter is that of the modes, of which at the `margins`, in points, there is no density.
     """
 
     values: Array
@@ -268,19 +268,17 @@ class RecordedTransition(NamedTuple):
     length: float
     log_mass: Number
     after: lw.Window
-    substep: Substep | None = None
-    offset: Number = 0.0
     margins: tuple[int, int] = 0, 0
 
 
 class Prediction(NamedTuple):
-    """The density after an interval, its grid, the logarithm of its mass, its grid check, and the transitions, where known."""
+    """The density after an interval, its grid, the logarithm of its mass, its grid check, and its transition if that is modal."""
 
     values: Array
     window: lw.Window
     gained: Number
     check: lw.GridCheck | None
-    transitions: tuple[RecordedTransition, ...] = ()
+    transition: ModalTransition | None = None
 
 
 def by_decomposition(prepared: Prepared, values: Array, window: lw.Window, length: float, report: Report) -> Prediction | None:
@@ -288,7 +286,7 @@ def by_decomposition(prepared: Prepared, values: Array, window: lw.Window, lengt
     negligible, rough = prepared.negligible, noise_bound(prepared.tolerance)
     carried = coarsened(prepared, values, window, length)
     if carried is not None:
-        transition = RecordedTransition(values, window, length, 0.0, carried.window, margins=carried.margins)
+        transition = ModalTransition(values, window, length, 0.0, carried.window, carried.margins)
         return _normalised(carried.values, carried.window, carried.error, report, negligible, transition)
     known, begin = lw.grid_check(values, window.closed, negligible).aliasing, window
     while window.size <= lw.LARGEST:
@@ -309,7 +307,7 @@ def by_decomposition(prepared: Prepared, values: Array, window: lw.Window, lengt
             report.time += missing
             if window != begin:  # noise that the new grid has brought, which the transition smooths before it is seen
                 report.aliasing = max(report.aliasing, lw.grid_check(values, window.closed, negligible).aliasing - known)
-            transition = RecordedTransition(values, window, length, 0.0, window)
+            transition = ModalTransition(values, window, length, 0.0, window)
             return _normalised(result[0], window, result[1], report, negligible, transition)
         new = lw.enlarged(window, left, right)
         if new == window:
@@ -343,7 +341,7 @@ def _by_substeps(
         parts = resolved_parts(prepared, values, window, interval)
         bounds, report.time = parts.bounds, report.time + parts.error
     stack, check = bounds[::-1], None
-    substeps, transitions, tails = 0, [], 0.0
+    substeps, tails = 0, 0.0
 
     def regridded(check: lw.GridCheck, first: float) -> tuple[Array, lw.Window]:
         """Return the density at a time of the interval on the grid for the next substep."""
@@ -379,9 +377,8 @@ def _by_substeps(
         report.aliasing = max(report.aliasing, fitted.brought)
         report.time += trial.error + fitted.missing
         after = window if trial.substep is None else lw.translated(window, trial.substep.speed * part.length)
-        before, values = values, np.where(trial.values.real > 0, trial.values, 0.0)
+        values = np.where(trial.values.real > 0, trial.values, 0.0)
         mass = np.sum(values)
-        transitions.append(RecordedTransition(before, window, part.length, np.log(mass), after, trial.substep, trial.offset))
         tails = max(tails + trial.lift - float(np.log(mass.real)), 0.0)
         values, window = values / mass, after
         gained = gained + np.log(mass) + trial.offset
@@ -389,7 +386,7 @@ def _by_substeps(
             values, window = regridded(check, last)
     if substeps >= MOST_SUBSTEPS:
         report.time = np.inf
-    return Prediction(values, window, gained, check, tuple(transitions)), tails
+    return Prediction(values, window, gained, check), tails
 
 
 class _Fitted(NamedTuple):
@@ -450,11 +447,11 @@ def _on_fitting_grid(
 
 
 def _normalised(
-    result: Array, window: lw.Window, error: float, report: Report, negligible: float, transition: RecordedTransition
+    result: Array, window: lw.Window, error: float, report: Report, negligible: float, transition: ModalTransition
 ) -> Prediction:
     check = lw.grid_check(result, window.closed, negligible)
     report.density(check)
     report.time, report.decomposed = report.time + error, True
     result = np.where(result.real > 0, result, 0.0)
     mass = np.sum(result)
-    return Prediction(result / mass, window, np.log(mass), check, (transition._replace(log_mass=np.log(mass)),))
+    return Prediction(result / mass, window, np.log(mass), check, transition._replace(log_mass=np.log(mass)))

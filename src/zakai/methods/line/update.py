@@ -8,7 +8,7 @@ import numpy as np
 
 from zakai.errors import InputError
 from zakai.methods.line.cache import Derived
-from zakai.methods.line.coefficients import covariance_at, tables
+from zakai.methods.line.coefficients import covariance_at, sensor_at_nodes, tables
 from zakai.methods.line.domain import variable_of
 from zakai.methods.line.model import System
 from zakai.methods.line.prepared import Prepared, State
@@ -26,10 +26,8 @@ from zakai.numerics.line.product import (
     General,
     Likelihood,
     Product,
-    at_nodes,
     finer,
     middles,
-    nodes,
     normalized,
     weak,
     weak_error,
@@ -213,7 +211,7 @@ def sampled_weakly(
     while True:
         at = int(np.argmax(values))
         centre = system.observation(window.points[at : at + 1, None], start, theta)[0]
-        fine = at_nodes(system.observation(nodes(window.points, window.spacing)[:, None], start, theta).T)
+        fine = sensor_at_nodes(prepared, window.points, window.spacing)
         logs, change = np.full(window.size, -np.inf), np.ones(window.size)
         weaken(fine, 0, precision, observed, np.ascontiguousarray(centre), logs, change)
         product, gained, depth, growth = normalized(values, logs, np.ones(window.size), float(values.max()))

@@ -22,7 +22,7 @@ from zakai.methods.line.backward import accuracy
 from zakai.methods.line.backward_interval import negligible, smoothing_tolerance
 from zakai.methods.line.coefficients import coefficients, covariance_at, resolved_parts
 from zakai.methods.line.message import SURE_OF_DENSITY, Message, points_of
-from zakai.methods.line.prepared import NOISE, Prepared, TimeInterval
+from zakai.methods.line.prepared import Prepared, TimeInterval
 from zakai.methods.line.update import factor_at_end
 from zakai.methods.line.volumes import cell_plan_of, pulled_back
 from zakai.methods.reflecting import filter as reflecting_filter
@@ -44,9 +44,9 @@ from zakai.methods.reflecting.elements import (
 from zakai.methods.reflecting.filter import State
 from zakai.numerics.arrays import Array, Number
 from zakai.numerics.line import window as lw
-from zakai.numerics.line.backward import SMALLEST
+from zakai.numerics.line.backward import EXCURSION, SMALLEST
 from zakai.numerics.line.density import support
-from zakai.numerics.line.resolution import ROUNDING, SMOOTHER_SHARE, SUPPORT
+from zakai.numerics.line.resolution import NOISE, ROUNDING, SMOOTHER_SHARE, SUPPORT
 from zakai.numerics.lobatto import Element
 
 PIECE = 10.0  # standard deviations of the noise in which states at the end share a transition
@@ -124,7 +124,6 @@ def _transition(prepared: Prepared, k: int, piece: Element, before: Array, obser
 
 
 POINTS = 256  # of a message, on the whole element of the density
-MODES_REACH = 4.0  # standard deviations of the noise around the supports of density and message
 QUADRATURE = 192  # points at which a message is projected onto the modes
 
 
@@ -221,7 +220,7 @@ def _by_modes(
     _, start, length, inside, _ = interval
     own, values = state.element, np.asarray(state.values).real
     G = covariance_at(prepared.system, own.points, start, prepared.theta.real)
-    reach = MODES_REACH * float(np.sqrt(np.max(G) * length))
+    reach = EXCURSION * float(np.sqrt(np.max(G) * length))
     domain = domain_of(prepared)
     low, high = np.clip([message.origin + end for end in message.ends], domain.lower, domain.upper).tolist()
     lower, upper = apart(min(own.lower, low) - reach, max(own.upper, high) + reach, domain)

@@ -27,6 +27,7 @@ from zakai.numerics.line.averages import GAUSS_NODES, GAUSS_WEIGHTS
 from zakai.numerics.line.grid_choice import DEPTH, WIDENING
 from zakai.numerics.line.operator import Spectral
 from zakai.numerics.line.resolution import RESOLVED, TRANSITION_SHARE, rounding_bound
+from zakai.numerics.line.window import CUT, LARGE
 from zakai.numerics.lobatto import Element
 
 ELEMENT_SIZES = (24, 32, 48, 64, 96, 128, 192, 256)
@@ -203,9 +204,6 @@ def moments(values: Array, element: Element) -> tuple[Number, Number]:
     return element.lower + mean, np.dot((x - mean) ** 2, values)
 
 
-COUNTS = 1e-14  # density relative to the maximum beyond which it is rounding
-EDGE_OF_ELEMENT = 1e-12  # density at an end that is not one of the domain, relative to the maximum
-LARGEST = 1000  # points of an element, above which no finer one is tried: its decomposition takes longer than volumes
 TRIALS = 24  # elements that are tried
 MOST_PARTS = 64  # of an interval that the volumes do not take as a whole
 PEAK = 1.5  # points in a standard deviation of the noise with which the first element begins
@@ -234,7 +232,7 @@ def _by_modes(
     _, start, length, inside, _ = interval
     G = covariance_at(prepared.system, element.points, start, prepared.theta).real
     noise = np.sqrt(np.maximum([np.min(G), np.max(G)], 0.0) * length)
-    counts = np.flatnonzero((values / element.weights).real > COUNTS * np.max((values / element.weights).real))
+    counts = np.flatnonzero((values / element.weights).real > CUT * np.max((values / element.weights).real))
     low, high = element.points[[max(counts[0] - 1, 0), min(counts[-1] + 1, len(values) - 1)]]
     lower, upper = apart(float(low - WIDENING * noise[1]), float(high + WIDENING * noise[1]), domain)
     longest = float(np.max(element_of(prepared, lower, upper, ELEMENT_SIZES[0]).halves))
@@ -260,8 +258,8 @@ def _by_modes(
             growth = float(np.sum(raised) / np.sum(result.real))
         coarse = unresolved > negligible
         # Oscillations of what is not resolved reach the ends as well.
-        left, right = (float(end) > (unresolved if coarse else EDGE_OF_ELEMENT) for end in reached(result, new, domain))
-        if coarse and size < ELEMENT_SIZES[-1] and len(result) <= LARGEST:
+        left, right = (float(end) > (unresolved if coarse else RESOLVED) for end in reached(result, new, domain))
+        if coarse and size < ELEMENT_SIZES[-1] and len(result) <= LARGE:  # else volumes are faster
             size = ELEMENT_SIZES[ELEMENT_SIZES.index(size) + 1]
         elif coarse:  # even more points take longer than volumes
             return None

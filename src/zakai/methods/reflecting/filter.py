@@ -16,7 +16,7 @@ from zakai.densities import IntervalDensity
 from zakai.errors import InputError
 from zakai.methods._protocol import Info
 from zakai.methods.line.domain import check_escape
-from zakai.methods.line.prepared import NOISE, Prepared
+from zakai.methods.line.prepared import Prepared
 from zakai.methods.line.report import Report
 from zakai.methods.line.update import error_remainder, factor_at_end, outside_tables, spread
 from zakai.methods.reflecting.elements import (
@@ -40,6 +40,7 @@ from zakai.models.prior import DensityPrior, Prior
 from zakai.numerics.arrays import Array, Number
 from zakai.numerics.line.grid_choice import DEPTH
 from zakai.numerics.line.product import General, Likelihood, normalized, place
+from zakai.numerics.line.resolution import NOISE
 from zakai.numerics.lobatto import Element
 from zakai.numerics.prior_grid import mixture_log_density, prior_grid
 

@@ -102,6 +102,7 @@ def panels(coefficients: Callable[[Array], Array], start: float, stop: float, to
     return Panels(accepted, error)
 
 
+_EXACT = 1e-14  # second Legendre coefficient in time, relative to the mean, that is rounding
 MOST_MAGNUS = 32  # equal parts of an interval with two averages each
 MEAN, EARLY, LATE, DIFFERENCE, SECOND = 0, 1, 2, 3, 4  # weights of a part
 
@@ -199,7 +200,7 @@ def _generated(u: Array, parts: Array, spread: float, spacing: float, weight: fl
 
 
 # Which operator (B, D, E) acts on which density, with which weight, and to which density it is added.  From the density 0 they
-# make 4 = [B, D] and 5 = [B, [B, E]] = B (B E - 2 E B) + E B B.
+# make 4 = [B, D] and 5 = [B, [B, E]] = B (B E - 2 E B) + E B B; the first four are those without E.
 _PRODUCTS = np.array(
     [
         (0, 0, 1, 1), (1, 0, 1, 2), (0, 2, 1, 4), (1, 1, -1, 4), (2, 0, 1, 3), (0, 3, 1, 6), (2, 1, -2, 6), (0, 6, 1, 5),
@@ -237,12 +238,20 @@ def averaging(values: Array, parts: Array, spreads: Array, spacing: float, close
     """Return estimates of the errors of the mean and of two averages in a part of an interval.
 
     With the integral B of the operator, D the difference of the averages and E the second Legendre coefficient they are
-    [B, D] / 4 + [B, [B, E]] / 10, and of fifth order 5 |[B, D] / 4|^(5/3) + [B, [B, E]] / 10.
+    [B, D] / 4 + [B, [B, E]] / 10, and of fifth order 5 |[B, D] / 4|^(5/3) + [B, [B, E]] / 10.  Of coefficients that are linear
+    in time E is rounding, and is left out.
     """
     size = values.size
     result = np.zeros((8, size))
     add(result[0], 1.0, values)
-    for operator, of, weight, to in _PRODUCTS:
+    linear = spreads[2] <= _EXACT * spreads[0]
+    for row in range(2):
+        whole, second = 0.0, 0.0
+        for j in range(size):
+            whole, second = max(whole, abs(parts[0, row, j])), max(second, abs(parts[2, row, j]))
+        linear &= second <= _EXACT * whole
+    for i in range(4 if linear else len(_PRODUCTS)):
+        operator, of, weight, to = _PRODUCTS[i]
         _generated(result[of], parts[operator], spreads[operator], spacing, float(weight), closed, result[to])
     one, two, mass, limit = 0.0, 0.0, 0.0, 1e-12 * values[highest_of(values)]
     for j in range(size):

@@ -20,7 +20,6 @@ PER = 8  # points of rows in a spacing of the grid
 _STENCIL = len(STENCIL_WEIGHTS)
 DEPTH = 36.0  # logarithm below the largest value from which cells are left out
 _TAIL = 32.0  # logarithm below the largest value at the ends of the range
-_CHANGE = 1.0  # of the likelihood in a cell, in standard deviations, up to which a cell is not divided
 LEVELS = 80
 MOST_CELLS = 4096
 
@@ -101,7 +100,8 @@ def _surveyed(
 def placed(logs: Array, first: int, last: int, likelihood: Likelihood) -> tuple[float, float, float]:
     """Return the range of the product as indices of the grid, and the narrowest cell in it; NaN where there are too many.
 
-    Cells whose bound is far below the largest value are left out, and the others divided until the likelihood hardly changes.
+    Cells whose bound is far below the largest value are left out, and the others divided until the likelihood changes
+    by less than a deviation.
 
     Args:
         logs: the logarithm of the density (N,).
@@ -122,7 +122,7 @@ def placed(logs: Array, first: int, last: int, likelihood: Likelihood) -> tuple[
             if highest + 0.5 * spread + 1.0 >= best - DEPTH:
                 depth = best - highest
                 change = np.sqrt(2.0 * (depth + spread)) - np.sqrt(2.0 * depth)
-                if change > _CHANGE and width[c] > 1e-13 * logs.size:
+                if change > 1.0 and width[c] > 1e-13 * logs.size:
                     if count + 2 * (MOST_CELLS - more + 1) > MOST_CELLS // 2:
                         return np.nan, np.nan, np.nan
                     more -= 1

@@ -23,7 +23,7 @@ from zakai.numerics.line.averages import AVERAGES, WHOLE
 from zakai.numerics.line.density import circular_rows, highest_of, moments, separated, shifted, spectrum, support, waves
 from zakai.numerics.line.gaussian_kernels import BAND, convolved, kernel_of
 from zakai.numerics.line.product import WEAK_SHARE, weak_error, weaken
-from zakai.numerics.line.resolution import LEAST_ROUNDING, RELIABLE, SPECTRUM_FACTOR, step_error
+from zakai.numerics.line.resolution import RELIABLE, RESOLVED, SPECTRUM_FACTOR, step_error
 from zakai.numerics.line.splitting import Accuracy, divided
 from zakai.numerics.line.steps import (
     AFTER,
@@ -135,7 +135,7 @@ def _loop(kernels: bool, splits: bool, varying: bool, samples: bool, weak: bool,
             elif splits:
                 accuracy = Accuracy(depth, limits[2] * shares[k], finest)
                 move = divided(density, local, c, averages, spacing, closed, varying, accuracy)
-            if not (move.error < np.inf and move.rounding < max(LEAST_ROUNDING, 1e-3 * most)):
+            if not (move.error < np.inf and move.rounding < max(RESOLVED, 1e-3 * most)):
                 answer[0], answer[1], answer[2] = float(low), float(high), move.needed
                 status = RANGE if move.needed > 0.0 and not (move.error < np.inf) else FAILED
                 break

@@ -27,10 +27,9 @@ from zakai.numerics.exponentials import exponentiate
 from zakai.numerics.line.density import highest_of
 from zakai.numerics.line.grid_choice import PER, Outlook, place_of, wanted, weigh, weighed
 from zakai.numerics.line.resolution import (
-    EDGE,
     EDGE_OF_ALIASING,
-    LEAST_ROUNDING,
     LOST_MASS,
+    RESOLVED,
     ROUNDING,
     SPECTRUM_FACTOR,
     SPECTRUM_SHARE,
@@ -279,9 +278,9 @@ def predicted(
         aliasing, top = unresolved(propagated, cosine, sine), propagated[highest_of(propagated)]
         on_left = max(abs(propagated[first]), abs(propagated[first + 1]))
         on_right = max(abs(propagated[last]), abs(propagated[last - 1]))
-        edge, bound = 0.0 if closed else max(on_left, on_right) / top, max(EDGE, EDGE_OF_ALIASING * aliasing)
+        edge, bound = 0.0 if closed else max(on_left, on_right) / top, max(RESOLVED, EDGE_OF_ALIASING * aliasing)
         resolved = aliasing <= max(SPECTRUM_FACTOR * negligible, SPECTRUM_SHARE * allowed)
-        if not (aliasing < np.inf and rounding <= max(LEAST_ROUNDING, 1e-3 * allowed) and (resolved or not stays)):
+        if not (aliasing < np.inf and rounding <= max(RESOLVED, 1e-3 * allowed) and (resolved or not stays)):
             status = FAILED
             break
         if edge <= bound and resolved:

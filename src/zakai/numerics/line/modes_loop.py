@@ -20,13 +20,13 @@ from zakai.numerics.line.density import highest_of, moments, separated, spectrum
 from zakai.numerics.line.grid_choice import PER, Likelihood, Outlook, differences, log_likelihood, outlook, place_of, sampled
 from zakai.numerics.line.modes import KnownGrids, Start, predicted
 from zakai.numerics.line.product import WEAK_SHARE, weak_error
-from zakai.numerics.line.resolution import RELIABLE, SPECTRUM_FACTOR, step_error
+from zakai.numerics.line.resolution import NOISE, RELIABLE, SPECTRUM_FACTOR, step_error
 from zakai.numerics.line.steps import AFTER, BROAD, FAILED, GRID, NARROW, OK, RANGE, SIZE, UNRESOLVED, product
 from zakai.numerics.line.window import CUT
 
 _V, _M, _T = float64[::1], float64[:, ::1], float64[:, :, ::1]
 
-LOG_NOISE = -33.4  # logarithm of the error of a decomposition relative to the maximum
+LOG_NOISE = float(np.log(NOISE))
 
 
 class Frame(NamedTuple):

@@ -305,49 +305,70 @@ def at_nodes(values: Array) -> Array:
     return np.ascontiguousarray(means[..., 1:-1] - (1.0 - _WITHIN**-2) / 24.0 * curvature)
 
 
+def places_of_nodes(values: Array, jumps: bool) -> Array:
+    """Return a function at the places (..., F, P) of the nodes of which the mean is the value of a node.
+
+    Of one with jumps they are all, as what depends on the function jumps too; else the only one is the node.
+    """
+    if not jumps:
+        return at_nodes(values)[..., None]
+    return np.ascontiguousarray(values[..., _WITHIN:-_WITHIN].reshape(*values.shape[:-1], -1, _WITHIN))
+
+
 def weak(values: Array, spacing: float) -> tuple[Array, Array]:
     """Return a function and its derivative (N,) from values at the nodes."""
     windows = np.lib.stride_tricks.sliding_window_view(values, len(_POSITIONS))[::NODES_OF_SPACING]
     return windows @ _VALUES, windows @ _SLOPES / spacing
 
 
-@kernel(void(_M, int64, _M, _V, _V, _V, _V))
+@kernel(void(float64[:, :, ::1], int64, _M, _V, _V, _V, _V))
 def weaken(fine: Array, start: int, precision: Array, observed: Array, centre: Array, b: Array, change: Array) -> None:
     """Replace log-likelihoods b (N,) of h at the points by those of its values at nodes.
 
     Args:
-        fine: h at the nodes (m, F) of a longer grid.
+        fine: h at the places of the nodes (m, F, P) of a longer grid, see `places_of_nodes`.
         start: the first point.
         precision, observed: S^-1 and y.
         centre: the values of h of which b is zero.
         b: receives the logarithms.
-        change: receives the relative difference of another rule.
+        change: receives the relative difference of another rule, with half of the places.
     """
-    m, size, length = fine.shape[0], b.size, (b.size + 2 * SPLINE_REACH - 1) * NODES_OF_SPACING
-    h, logs = np.empty((m, length)), np.zeros(length)
+    m, size, places, count = fine.shape[0], b.size, fine.shape[2], (b.size + 2 * SPLINE_REACH - 1) * NODES_OF_SPACING
+    h, inner = np.empty((m, count * places)), np.zeros(count * places)
     for i in range(m):
-        for f in range(length):
-            h[i, f] = fine[i, start * NODES_OF_SPACING + f]
-    exponent_added(h, centre, precision, observed, 1.0, 1.0, logs)
-    tops = np.empty(length // NODES_OF_SPACING)
+        for f in range(count):
+            for p in range(places):
+                h[i, f * places + p] = fine[i, start * NODES_OF_SPACING + f, p]
+    exponent_added(h, centre, precision, observed, 1.0, 1.0, inner)
+    tops, together = np.empty(count // NODES_OF_SPACING), NODES_OF_SPACING * places
     for cell in range(tops.size):
         tops[cell] = -np.inf
-        for f in range(cell * NODES_OF_SPACING, (cell + 1) * NODES_OF_SPACING):
-            tops[cell] = max(tops[cell], logs[f])
-        for f in range(cell * NODES_OF_SPACING, (cell + 1) * NODES_OF_SPACING):
-            logs[f] = np.exp(logs[f] - tops[cell])
+        for f in range(cell * together, (cell + 1) * together):
+            tops[cell] = max(tops[cell], inner[f])
+        for f in range(cell * together, (cell + 1) * together):
+            inner[f] = np.exp(inner[f] - tops[cell])
+    values = inner
+    if places > 1:
+        values = np.zeros(count)
+        for f in range(count * places):
+            values[f // places] += inner[f] / places
     for j in range(size):
-        one, other, top = 0.0, 0.0, max(tops[j + SPLINE_REACH - 1], tops[j + SPLINE_REACH])
+        one, other, half, top = 0.0, 0.0, 0.0, max(tops[j + SPLINE_REACH - 1], tops[j + SPLINE_REACH])
         for cell in range(2 * SPLINE_REACH):
-            here, there = 0.0, 0.0
+            here, there, first = 0.0, 0.0, (j + cell) * NODES_OF_SPACING
             for f in range(NODES_OF_SPACING):
-                here += _VALUES[cell * NODES_OF_SPACING + f] * logs[(j + cell) * NODES_OF_SPACING + f]
-                there += _OTHER[cell * NODES_OF_SPACING + f] * logs[(j + cell) * NODES_OF_SPACING + f]
+                here += _VALUES[cell * NODES_OF_SPACING + f] * values[first + f]
+                there += _OTHER[cell * NODES_OF_SPACING + f] * values[first + f]
             scale = np.exp(min(tops[j + cell] - top, 600.0))
             one, other = one + scale * here, other + scale * there
+            if places > 1:
+                for f in range(0, together, 2):
+                    half += scale * _VALUES[cell * NODES_OF_SPACING + f // places] * inner[first * places + f] * 2.0 / places
         change[j] = 1.0
         if 0.0 < one < np.inf:
             b[j], change[j] = top + np.log(one), 1.0 - other / one
+            if places > 1:
+                change[j] += 1.0 - half / one
 
 
 @kernel(float64(_V, _V))

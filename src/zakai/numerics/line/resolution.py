@@ -8,16 +8,14 @@ from __future__ import annotations
 
 from zakai.numerics.compiled import helper
 
-NEGLIGIBLE = 1e-13  # spectrum relative to the mass that need not be resolved
+NOISE = 3e-15  # error of a density relative to its maximum, which matters in its tails
 SPECTRUM_FACTOR = 30.0  # times the spectrum that need not be resolved: more needs another grid
 SPECTRUM_SHARE = 1e-5  # of the tolerance that a transition may leave at the highest frequencies
 GROSS = 1e-4  # spectrum at the highest frequencies from which it is that of what a grid does not resolve, not of noise
 LOST_ALIASING = 0.1  # from which the density is lost
-RESOLVED = 1e-11  # spectrum, or Legendre coefficient, at the highest frequencies that is rounding
-EDGE = 1e-11  # density at the outermost points, relative to the maximum, that a grid may cut off
+RESOLVED = 1e-11  # spectrum or Legendre coefficient at the highest frequencies, end of a grid, and rounding that do not count
 EDGE_OF_ALIASING = 4.0  # spectra at the highest frequencies, whose waves reach the ends as well
 ROUNDING = 4e-16  # rounding error of a decomposition or an exponential, relative to the norm
-LEAST_ROUNDING = 1e-11  # rounding error of a transition that needs no other one
 RELIABLE = 1e-3  # of the promised error: smaller estimates are not reported
 TRANSITION_SHARE = 0.1  # of the tolerance that a transition of its own kind may leave, or lose of the mass
 SMOOTHER_SHARE = 0.01  # of the error that an interval of a smoother may make: what modes and rounding may leave
@@ -38,12 +36,12 @@ def noise_bound(tolerance: float) -> float:
 
 def edge_bound(aliasing: float) -> float:
     """Return the largest density at the ends of a grid, relative to the maximum, with a spectrum at the highest frequencies."""
-    return max(EDGE, EDGE_OF_ALIASING * aliasing)
+    return max(RESOLVED, EDGE_OF_ALIASING * aliasing)
 
 
 def rounding_bound(tolerance: float) -> float:
     """Return the largest rounding error of a transition."""
-    return max(LEAST_ROUNDING, SPECTRUM_SHARE * tolerance)
+    return max(RESOLVED, SPECTRUM_SHARE * tolerance)
 
 
 def error_made(aliasing: float, edge: float, negative: float, time: float, amplified: float) -> float:

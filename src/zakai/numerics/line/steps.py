@@ -73,7 +73,7 @@ class Grid(NamedTuple):
     """The data of a grid: terms `table` (K, R, 4 + m, T) as in `line/steps.py`, K = 1 where they do not depend on the interval.
 
     The table is longer than the grid, which begins at `start`; its first point is `offset` away from the origin of the kernels.
-    `fine` (m, F) are the values of an h with kinks at the nodes of `line/product.py`, else empty.
+    `fine` (m, F, P) are the values of an h with kinks or jumps at the nodes of `line/product.py`, else empty.
     """
 
     table: Array
@@ -155,7 +155,7 @@ class Results(NamedTuple):
 # Their types in kernels.
 _V, _M, _T, _Q = float64[::1], float64[:, ::1], float64[:, :, ::1], float64[:, :, :, ::1]
 START_TYPE = types.NamedTuple([_V, float64, float64], Start)
-GRID_TYPE = types.NamedTuple([_Q, int64, float64, float64, _M], Grid)
+GRID_TYPE = types.NamedTuple([_Q, int64, float64, float64, _T], Grid)
 STEPS_TYPE = types.NamedTuple([int64[::1], _V, _V, _Q, _V, _M, _T, _T, _M], Steps)
 CONSTANTS_TYPE = types.NamedTuple([_T, _M, _M], Constants)
 RESULTS_TYPE = types.NamedUniTuple(_M, 2, Results)

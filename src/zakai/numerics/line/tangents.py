@@ -4,10 +4,7 @@ With u = s v, v_t = -H v and the decomposition H = U diag(lambda) U', the deriva
 
     U (Q o (U' dH U)) U',   Q_ij = (exp(-tau lambda_i) - exp(-tau lambda_j)) / (lambda_i - lambda_j),
 
-exact for every tau (Daleckii and Krein 1965).  Without a decomposition Taylor's series of exp(L) u is differentiated term by
-term,
-
-    w_k = L w_k-1 / k,      dw_k = (L dw_k-1 + dL w_k-1) / k.
+exact for every tau (Daleckii and Krein 1965).
 """
 
 from __future__ import annotations
@@ -16,106 +13,14 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numba import float64, void
 from scipy.special import erfc
 
 from zakai.numerics.arrays import Array
-from zakai.numerics.compiled import kernel
 from zakai.numerics.complex_step import STEP
 from zakai.numerics.line.modes import FALL
-from zakai.numerics.line.operator import FourierOperator, Generator, Spectral, derivatives, exponential_of, quotients
+from zakai.numerics.line.operator import Spectral, quotients
 from zakai.numerics.line.resolution import ROUNDING
 from zakai.numerics.line.window import CUT, SMALL, Window, density_at, gathered, interpolated, local_polynomial
-
-TERMS = 40
-PART = 3.0  # norm up to which one Taylor series is summed
-LONG = 0.06  # norm over size^2 from which series take longer than an exponential by complex steps
-
-_M = float64[:, ::1]
-
-
-def exponential_tangents(
-    window: Window, coefficients: Generator, changed: Sequence[Generator], values: Array, tangents: Array
-) -> tuple[Array, Array]:
-    """Return exp(L) u and its derivatives (p, N).
-
-    Args:
-        coefficients: those of L.
-        changed: the same at p parameters with infinitesimal imaginary parts.
-        values: u (N,).
-        tangents: its derivatives (p, N).
-    """
-    matrix = window.generator(*coefficients)
-    if isinstance(matrix, FourierOperator):
-        return _by_complex_steps(window, changed, values, tangents)
-    size, unit = window.size, 1.0 if window.closed else window.spacing
-    shift = float(np.trace(matrix)) / size
-    norm = float(np.abs(matrix - shift * np.eye(size)).sum(axis=0).max())
-    if not np.isfinite(norm):
-        return np.full_like(values, np.nan), np.full_like(tangents, np.nan)
-    scales = 0.5 / unit**2, 1.0 / unit, 1.0
-    if norm > LONG * size**2:
-        return _by_complex_steps(window, changed, values, tangents)
-    rows = np.zeros((3, 1 + len(changed), size))  # of G, f and V: the values, and their derivatives
-    for row, scale, *parts in zip(rows, scales, coefficients, *changed, strict=True):
-        row[0] = scale * parts[0]
-        row[1:] = [scale * np.imag(one) / STEP * np.ones(size) for one in parts[1:]]
-    rows[2, 0] -= shift
-    result = np.concatenate([values[None], tangents])
-    _taylor(np.concatenate(derivatives(size, window.closed)), *rows, result, shift, norm)
-    return result[0], result[1:]
-
-
-def _by_complex_steps(window: Window, changed: Sequence[Generator], values: Array, tangents: Array) -> tuple[Array, Array]:
-    pairs = zip(changed, tangents, strict=True)
-    after = np.array([exponential_of(window.generator(*one))(values + 1j * STEP * tangent)[0] for one, tangent in pairs])
-    return after[0].real, after.imag / STEP
-
-
-@kernel(void(_M, _M, _M, _M, _M, float64, float64))
-def _taylor(matrices: Array, covariance: Array, drift: Array, potential: Array, rows: Array, shift: float, norm: float) -> None:
-    """Replace a vector and its derivatives, the rows (1 + p, N), by those after the exponential.
-
-    Args:
-        matrices: those of the first derivative, antisymmetric, and of the second, symmetric (2 N, N).
-        covariance, drift, potential: G / 2, f and V - shift in units of the spacing, and their derivatives (1 + p, N).
-        rows: the vectors.
-        shift: a number that is added to V.
-        norm: a bound of the norm of the operator without it.
-    """
-    count, size = rows.shape
-    parts = max(1, int(np.ceil(norm / PART)))
-    factor = np.exp(shift / parts)
-    products, largest = np.empty((count, 2 * size)), np.empty(count)
-    for _ in range(parts):
-        term = rows.copy()
-        for i in range(count):
-            largest[i] = np.max(np.abs(rows[i]))
-        for k in range(1, TERMS):
-            for i in range(count):
-                for j in range(size):
-                    products[i, j] = drift[0, j] * term[i, j]
-                    products[i, size + j] = covariance[0, j] * term[i, j]
-                    if i > 0:
-                        products[i, j] += drift[i, j] * term[0, j]
-                        products[i, size + j] += covariance[i, j] * term[0, j]
-            propagated = np.dot(products, matrices)
-            scale, settled = 1.0 / (parts * k), True
-            for i in range(count):
-                change = 0.0
-                for j in range(size):
-                    result = propagated[i, j] + potential[0, j] * term[i, j]
-                    if i > 0:
-                        result += potential[i, j] * term[0, j]
-                    result *= scale
-                    rows[i, j] += result
-                    propagated[i, j] = result
-                    change = max(change, abs(result))
-                settled = settled and change <= 1e-17 * largest[i]
-            term = propagated
-            if settled:
-                break
-        rows *= factor
 
 
 class Varied(NamedTuple):

@@ -17,7 +17,7 @@ from zakai.numerics.arrays import Array
 from zakai.numerics.complex_step import angle, is_complex, real_product
 from zakai.numerics.line.density import spectrum, spectrum_of_many, waves
 from zakai.numerics.line.operator import FourierOperator, generator
-from zakai.numerics.line.resolution import NEGLIGIBLE, SPECTRUM_FACTOR
+from zakai.numerics.line.resolution import SPECTRUM_FACTOR
 
 _STENCIL = np.arange(-3, 5)
 STENCIL_WEIGHTS = np.array([1.0 / np.prod([float(i - j) for j in _STENCIL if j != i]) for i in _STENCIL])
@@ -167,7 +167,7 @@ class GridCheck(NamedTuple):
         return self.aliasing > SPECTRUM_FACTOR * negligible and (self.aliasing > noise or not self.rough)
 
 
-def grid_check(values: Array, closed: bool, negligible: float = NEGLIGIBLE, cut: float = CUT) -> GridCheck:
+def grid_check(values: Array, closed: bool, negligible: float = CUT, cut: float = CUT) -> GridCheck:
     """Return the figures of a density.
 
     Args:
