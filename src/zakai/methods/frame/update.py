@@ -117,8 +117,7 @@ def _in_frame(v: Train) -> tuple[Array, Array]:
 
 def depth_of(u: Carried, mass: Mass, posterior: Train, tolerance: float) -> float:
     """Return log(max u / u) where the posterior is, of a prediction known to a share of max u; zero for equal Gaussians."""
-    points, weights = posterior.cloud(DEPTH_POINTS)
-    values = u(np.concatenate([points, mass.points], axis=1))
+    here, n = Mass(*posterior.cloud(CLOUD)).thinned(DEPTH_POINTS), posterior.grid.n
+    values = u(np.concatenate([here.points, mass.thinned(2 * DEPTH_POINTS).points], axis=1))
     values = np.where(values > 0, values, tolerance * values.max())  # no more is known of it where it is not positive
-    count, n = len(weights), len(points)
-    return float(math.log(values[count:].max()) - weights @ np.log(values[:count]) - 0.5 * n)
+    return float(math.log(values.max()) - here.weights @ np.log(values[:DEPTH_POINTS]) - 0.5 * n)

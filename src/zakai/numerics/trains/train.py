@@ -195,11 +195,17 @@ class Train:
         Half are draws, half draws of conditional laws in proportion to their square roots, weighted as draws of the mixture:
         parts with little mass, and tails, have points too.
         """
-        x, likely, drawn = self._proposed(count)
-        # The square roots of an axis with no mass are drawn nowhere; both probabilities are zero there.
-        weights = likely / np.maximum(0.5 * likely + 0.5 * drawn, 1e-300)
-        weights = weights / weights.sum()
-        return self._with_moments(x, weights), weights
+        if count not in self._clouds:
+            x, likely, drawn = self._proposed(count)
+            weights = np.maximum(self.evaluate(x), 0.0) / np.maximum(likely + drawn, 1e-300)
+            weights = weights / weights.sum()
+            self._clouds[count] = self._with_moments(x, weights), weights
+        return self._clouds[count]
+
+    @cached_property
+    def _clouds(self) -> dict[int, tuple[Array, Array]]:
+        """The clouds that were drawn, by their numbers of points."""
+        return {}
 
     def quadrature(self, count: int) -> tuple[Array, Array]:
         """Return points (n, P) with weights (P,), sums over which are integrals of the normalised train; `count` is even.
