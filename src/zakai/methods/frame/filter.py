@@ -266,7 +266,7 @@ def predicted(chain: Chain, state: State, likelihood: Likelihood) -> Predicted:
     found, builder = _predicted(chain, state, likelihood), chain.builder
     mass = found.prediction.mass.unwrapped(chain.prepared.system.base.angles)
     depth = mass.depth(chain.prepared.motion.logs(likelihood, mass.points))
-    if DEEP < depth < math.log(1.0 / builder.rule.tolerance):
+    if depth > DEEP:
         builder.reports.clear()
         builder.sharper = max(math.exp(-depth), SHARPEST)
         found = _predicted(chain, state, likelihood)
