@@ -21,7 +21,7 @@ CONTROLS = 600  # with 96 the tails of a skewed density of three states were nev
 CLOUD = 1024
 # The error of a mean is .2 to 1 times that of a build in L1, whose signs cancel, on 20 systems of three to six states: a build
 # has the whole tolerance.  With more for a core the mean of Lorenz-63 is off by three times its estimate: tails no point shows.
-SHARE, CORES = 0.6, 0.25
+SHARE, CORES = 0.4, 0.25
 LEAST = 0.6  # of the tolerance that earlier errors may leave
 EDGE = 0.3  # share of the tolerance that may be near an end of an axis
 ROUGH = 4.0  # tolerances of error off the grid, above which the grid is made finer
