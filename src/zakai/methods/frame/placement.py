@@ -60,12 +60,6 @@ class Mass:
         unit = P / np.outer(scale, scale) + 1e-9 * np.eye(len(P))
         return np.asarray(np.linalg.solve(unit, (apart * self.weights) @ moved.T).T / scale)
 
-    def thinned(self, count: int) -> Mass:
-        """Return so many of the points, equally far apart in their order."""
-        kept = np.arange(count) * len(self.weights) // count
-        weights = self.weights[kept]
-        return Mass(np.ascontiguousarray(self.points[:, kept]), weights / weights.sum())
-
     def reweighted(self, logs: Array) -> Mass:
         """Return the points with weights times the exponentials of numbers (P,)."""
         weights = self.weights * np.exp(logs - logs.max())

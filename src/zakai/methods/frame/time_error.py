@@ -19,7 +19,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from zakai.methods.frame.build import CLOUD
 from zakai.methods.frame.chain import Chain
 from zakai.methods.frame.errors import Error, hermite, root_of
 from zakai.methods.frame.placement import Mass
@@ -28,7 +27,7 @@ from zakai.numerics.trains.carried import Likelihood
 from zakai.numerics.trains.train import Train
 
 # Points, each with four noises, for a tolerance below this one, and for another: their chance is .2 to .5 of it.
-POINTS, FEWER_POINTS, SMALL = 512, 128, 3e-3
+POINTS, FEWER_POINTS, SMALL = 512, 128, 1e-2
 FEW = 100.0  # effective points that a likelihood must leave, or a power of it is taken
 FLOW = 0.1  # error of a flow in tolerances of a build, as in `Chain`
 LEAST = 0.25  # share of the square of an error that is left when that of the points is subtracted
@@ -47,7 +46,7 @@ def measured(chain: Chain, u: Train, count: int, likelihood: Likelihood) -> Time
     prepared, motion = chain.prepared, chain.prepared.motion
     angles = prepared.system.base.angles
     number = POINTS if chain.builder.allowed < SMALL else FEWER_POINTS
-    before = Mass(*u.cloud(CLOUD)).thinned(number).unwrapped(angles)
+    before = Mass(*u.cloud(number)).unwrapped(angles)
     (x, gained), (y, finer) = _moved(chain, before, count)
     # The likelihood weighs the points of both.
     gained, finer = gained + motion.logs(likelihood, x), finer + motion.logs(likelihood, y)

@@ -19,7 +19,7 @@ from zakai.numerics.trains.train import Train
 
 FEW = 30.0  # effective points of the prediction that a likelihood must leave, or powers of it are taken
 MOST_POWERS = 24  # an observation sixty deviations away needs fifteen
-DEPTH_POINTS = 128
+DEPTH_POINTS, APART = 128, 3  # an odd distance leaves quasi-random points evenly spread
 ROUGHLY = 0.01  # relative error that densities between powers of a likelihood need: they only show where the mass is
 OFF_CENTRE, NARROW, WIDE = 0.5, 0.6, 1.6  # shift and deviation of a density in its frame, from which it gets another frame
 LOST = 3.0  # shift in that other frame, from which the density is in a corner of its box
@@ -117,7 +117,7 @@ def _in_frame(v: Train) -> tuple[Array, Array]:
 
 def depth_of(u: Carried, mass: Mass, posterior: Train, tolerance: float) -> float:
     """Return log(max u / u) where the posterior is, of a prediction known to a share of max u; zero for equal Gaussians."""
-    here, n = Mass(*posterior.cloud(CLOUD)).thinned(DEPTH_POINTS), posterior.grid.n
-    values = u(np.concatenate([here.points, mass.thinned(2 * DEPTH_POINTS).points], axis=1))
+    points, weights = posterior.cloud(DEPTH_POINTS)
+    values = u(np.concatenate([points, mass.points[:, ::APART]], axis=1))
     values = np.where(values > 0, values, tolerance * values.max())  # no more is known of it where it is not positive
-    return float(math.log(values.max()) - here.weights @ np.log(values[:DEPTH_POINTS]) - 0.5 * n)
+    return float(math.log(values.max()) - weights @ np.log(values[:DEPTH_POINTS]) - 0.5 * len(points))

@@ -197,14 +197,15 @@ class Train:
         cells instead a point in the steep tail of a ridge counts too much, and errors there are taken for errors of the mean.
 
         Raises:
-            LinAlgError: the train is positive at none of them.
+            LinAlgError: the train is positive at none of them, or infinite.
         """
         if count not in self._clouds:
             x, likely, drawn = self._proposed(count)
             values = np.maximum(self.evaluate(x), 0.0)
-            if not 0.0 < values.max() < math.inf:
-                raise np.linalg.LinAlgError("a density is not positive at points of its mass")
-            weights = values / values.max() / np.maximum(likely + drawn, 1e-300)
+            top = float(values.max())  # NaN where the density is lost
+            if top == 0.0 or math.isinf(top):
+                raise np.linalg.LinAlgError("a density is not positive and finite at points of its mass")
+            weights = values / top / np.maximum(likely + drawn, 1e-300)
             weights = weights / weights.sum()
             self._clouds[count] = self._with_moments(x, weights), weights
         return self._clouds[count]
