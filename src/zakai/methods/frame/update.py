@@ -83,6 +83,8 @@ def _product(
     builder: Builder, prediction: Prediction, mass: Mass, likelihood: Likelihood, power: float, loose: float
 ) -> tuple[Train, float]:
     """Return the prediction times a power of the likelihood over its largest value on the mass, and the log of that value."""
+    if not np.isfinite(mass.weights).all():
+        raise Unresolved("the density has no mass on the way to the observation")
     logs = builder.prepared.motion.logs(likelihood, mass.points)
     top = power * float(np.max(logs[mass.weights > 1e-3 * mass.weights.max()]))
     function = prediction.function.times(likelihood._replace(power=power, top=top))

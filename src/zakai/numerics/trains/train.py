@@ -194,18 +194,15 @@ class Train:
 
         Half are draws, half draws of conditional laws in proportion to their square roots: parts with little mass, and tails, have
         points too.  They are weighted as draws of the mixture, by the values of the train where they are: with the masses of the
-        cells instead a point in the steep tail of a ridge counts too much, and errors there are taken for errors of the mean.
-
-        Raises:
-            LinAlgError: the train is positive at none of them, or infinite.
+        cells instead a point in the steep tail of a ridge counts too much, and errors there are taken for errors of the mean.  The
+        weights are NaN where the train is positive at none of the points, or infinite.
         """
         if count not in self._clouds:
             x, likely, drawn = self._proposed(count)
             values = np.maximum(self.evaluate(x), 0.0)
-            top = float(values.max())  # NaN where the density is lost
-            if top == 0.0 or math.isinf(top):
-                raise np.linalg.LinAlgError("a density is not positive and finite at points of its mass")
-            weights = values / top / np.maximum(likely + drawn, 1e-300)
+            top = float(values.max())
+            values = values / top if 0.0 < top < math.inf else np.full(count, np.nan)
+            weights = values / np.maximum(likely + drawn, 1e-300)
             weights = weights / weights.sum()
             self._clouds[count] = self._with_moments(x, weights), weights
         return self._clouds[count]
