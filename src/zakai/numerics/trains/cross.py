@@ -108,7 +108,7 @@ class _Cross:
         return found
 
     def begin(self, index: Array, expected: Sequence[int]) -> None:
-        """Choose the sets to the right from grid indices (P, n): columns that span those of all pairs of a left and a right part."""
+        """Choose the sets to the right from grid indices (P, n): columns that span those of all pairs of their parts."""
         grid, B, parts = self.grid, self.grid.basis, list[tuple[Array, Array]]()
         for k in range(1, grid.n):
             count = min(TIMES * expected[k] + MORE, len(index))
@@ -151,8 +151,9 @@ class _Cross:
 
 
 def cross(
-    grid: Grid, function: Function, control: tuple[Array, Array], options: Options, periods: Array, expected: Sequence[int] | None = None
-) -> Built:
+    grid: Grid, function: Function, control: tuple[Array, Array], options: Options, periods: Array,
+    expected: Sequence[int] | None = None,
+) -> Built:  # fmt: skip
     """Return a function on a grid as a train.
 
     Args:

@@ -190,12 +190,12 @@ class Train:
         return self.grid.x_of(z), out[n:]
 
     def cloud(self, count: int) -> tuple[Array, Array]:
-        """Return points of the mass (n, P) with weights (P,), sums over which are integrals of the normalised train; `count` is even.
+        """Return points of the mass (n, P) with weights (P,), sums over which are integrals of the normalised train.
 
-        Half are draws, half draws of conditional laws in proportion to their square roots: parts with little mass, and tails, have
-        points too.  They are weighted as draws of the mixture, by the values of the train where they are: with the masses of the
-        cells instead a point in the steep tail of a ridge counts too much, and errors there are taken for errors of the mean.  The
-        weights are NaN where the train is positive at none of the points, or infinite.
+        Half of an even `count` are draws, half draws of conditional laws in proportion to their square roots: parts with little
+        mass, and tails, have points too.  They are weighted as draws of the mixture, by the values of the train where they are:
+        with the masses of the cells instead a point in the steep tail of a ridge counts too much, and its error is taken for one
+        of the mean.  The weights are NaN where the train is positive at none of the points, or infinite.
         """
         if count not in self._clouds:
             x, likely, drawn = self._proposed(count)
