@@ -1,6 +1,6 @@
 """Systems of three to six states: the true error of `tensor-train` at its default tolerance, and its estimate.
 
-    python benchmarks/several_states_errors.py [NAME ...] [--finer 8] [--most-rank 60]
+    python benchmarks/several_states_errors.py [NAME ...] [--finer 16] [--most-rank 60]
 
 The systems are those of `choices_systems.py`, and of `several_states.py` with a + after their names.  The judge is the same
 method at a tolerance that is `finer` times smaller, with larger ranks; it is kept in a file, ! says that it warns.  Errors are
@@ -59,7 +59,7 @@ def main() -> None:
     """Print a row for each system and a sum."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("names", nargs="*")
-    parser.add_argument("--finer", type=float, default=8.0)
+    parser.add_argument("--finer", type=float, default=16.0)
     parser.add_argument("--most-rank", type=int, default=60)
     args = parser.parse_args()
     warnings.simplefilter("ignore")

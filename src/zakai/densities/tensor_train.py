@@ -42,8 +42,6 @@ class Train(Protocol):
 
     def cloud(self, count: int) -> tuple[np.ndarray, np.ndarray]: ...
 
-    def quadrature(self, count: int) -> tuple[np.ndarray, np.ndarray]: ...
-
 
 @dataclass(frozen=True, repr=False)
 class TensorTrainDensity(DensityMethods):
@@ -111,7 +109,7 @@ class TensorTrainDensity(DensityMethods):
 
     def quadrature(self, count: int) -> tuple[np.ndarray, np.ndarray]:
         """Return fixed weights (N,) and points (N, n), sums over which are expectations; N is about `count`."""
-        points, weights = self.train.quadrature(2 * (count // 2))
+        points, weights = self.train.cloud(2 * (count // 2))
         return weights, points.T
 
     def quantile(self, q: Sequence[float]) -> np.ndarray:

@@ -33,7 +33,7 @@ def begun(prepared: Prepared, function: Callable[[Array], Array], choice: Choice
 def step(chain: Chain, state: State, made: Made, figures: Sequence[str]) -> tuple[State, Info]:
     """Return the state after an interval, and its report without figures."""
     prepared, interval = chain.prepared, chain.interval
-    u = state.train(prepared.system.periods)
+    u = prepared.train(state)
     predictions = [_predicted(chain, u, halves) for halves in made.motions]
     first, function = predictions[0], predictions[0].function
     if len(predictions) > 1:
@@ -83,7 +83,7 @@ def _in_frame(Q: Array, v: Train) -> Array:
 def _built(prepared: Prepared, function: Callable[[Array], Array], choice: Choice) -> Train:
     """Return a function as a train on a known grid."""
     options = choice.options._replace(tolerance=FINER * choice.options.tolerance)
-    v = cross(choice.grid, function, choice.control, options, prepared.system.periods, choice.rank).train
+    v = cross(choice.grid, function, choice.control, options, prepared.system.periods, choice.ranks).train
     if not v.mass > 0 or not math.isfinite(v.mass):
         raise Unresolved(f"a density has mass {v.mass:.1g} on a grid of another run")
     return v

@@ -81,7 +81,7 @@ def message(prepared: Prepared, state: State) -> Message:
 
 def begin(prepared: Prepared, state: State, count: int, seed: int) -> Message:
     """Return so many draws of the filter's density at the last time."""
-    u, n = state.train(prepared.system.periods), prepared.model.n
+    u, n = prepared.train(state), prepared.model.n
     rng, nothing = _generator(state.control.interval, seed), np.zeros((n, count))
     found = drawn_before(u, np.full(n, np.inf), nothing, rng.random((2 * n, count)))
     draws = np.where(found.exists, u.grid.x_of(found.z), np.nan)
@@ -130,7 +130,7 @@ def smoothed(prepared: Prepared, state: State, later: Message) -> tuple[Message,
     draws, angles = later.draws, prepared.system.base.angles
     n, count = draws.shape
     if later.last:
-        u = state.train(prepared.system.periods)
+        u = prepared.train(state)
         mean, cov = u.moments(direction_of(prepared, u))
         errors = np.zeros(n)
     elif later.moments is not None:

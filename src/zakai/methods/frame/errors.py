@@ -58,15 +58,25 @@ class Error(NamedTuple):
         return cls.zero(n)._replace(spread=error**2 * np.eye(n))
 
     @classmethod
-    def of(cls, parts: Array, n: int) -> Error:
-        """Return the error of which points have parts: the sums of `hermite` times weights times errors (n + n^2 + n^3, P).
+    def of(cls, z: Array, shares: Array) -> Error:
+        """Return the error of points z (n, P) whose relative errors times their weights are `shares` (P,).
 
         The third derivatives are shrunk by the share of their size that chance explains.
         """
+        n, one, moved = len(z), np.eye(len(z)), shares * z
+        first, square = moved.sum(axis=1), (z * z).sum(axis=0)
+        pairs = (moved[:, None] * z).reshape(n * n, -1)
+        third = (pairs @ z.T).reshape(n, n, n) - _with_unit(first)
+        # The sum of the squares of the Hermite polynomials of degree three.
+        sizes = square * (square * (square - 6.0) + 3.0 * n + 6.0)
+        return cls(first, moved @ z.T - shares.sum() * one, _certain(third, float(shares**2 @ sizes)), moved @ moved.T)
+
+    @classmethod
+    def between(cls, parts: Array, n: int) -> Error:
+        """Return the error of which groups of points have parts, the sums of `hermite` times their shares (n + n^2 + n^3, P)."""
         total = parts.sum(axis=1)
-        third, chance = total[n + n * n :], float((parts[n + n * n :] ** 2).sum())
-        third = third * max(0.0, 1.0 - CERTAIN * chance / max(float(third @ third), 1e-300))
-        return cls(total[:n], total[n : n + n * n].reshape(n, n), third.reshape(n, n, n), parts[:n] @ parts[:n].T)
+        third = _certain(total[n + n * n :].reshape(n, n, n), float((parts[n + n * n :] ** 2).sum()))
+        return cls(total[:n], total[n : n + n * n].reshape(n, n), third, np.zeros((n, n)))
 
     def plus(self, other: Error, factor: float = 1.0) -> Error:
         """Return the sum with an error times a factor; what chance adds is independent."""
@@ -127,27 +137,45 @@ class Missed:
         """
         logs = np.maximum(logs, np.max(logs) - 1e6) if np.isfinite(logs).any() else np.zeros(len(logs))
         mass = self.mass.unwrapped(angles)
-        seen, n = mass.reweighted(logs), len(cov)
+        seen = mass.reweighted(logs)
         few = seen.effective < FEW
         if few:
             seen = mass.reweighted(mass.power(logs, FEW) * logs)
         mean, P = seen.moments()
         z = np.linalg.solve(root_of(P), seen.points - mean[:, None])
         shares = seen.weights * (self.relative - self.relative @ seen.weights)
-        found = Error.of(shares * hermite(z), n)
+        found = Error.of(z, shares)
         if few:
-            found = found.seen(np.linalg.solve(root_of(P), root_of(cov)), np.zeros(n))
+            found = found.seen(np.linalg.solve(root_of(P), root_of(cov)), np.zeros(len(cov)))
         size, most = found.in_deviations(root_of(cov)), MOST * self.size * math.exp(min(max(mass.depth(logs), 0.0), DEEPEST))
         return found.scaled(min(1.0, most / max(size, 1e-300)))
 
 
 def hermite(z: Array) -> Array:
     """Return the Hermite polynomials of degrees one, two and three of points z (n, P), one after the other (n + n^2 + n^3, P)."""
-    n, one = len(z), np.eye(len(z))
-    pairs = z[:, None] * z
-    cubes = pairs[:, :, None] * z
-    cubes -= one[:, :, None, None] * z + one[:, None, :, None] * z[:, None] + one[None, :, :, None] * z[:, None, None]
-    return np.concatenate([z, (pairs - one[:, :, None]).reshape(n * n, -1), cubes.reshape(n**3, -1)])
+    n = len(z)
+    out = np.empty((n + n * n + n**3, z.shape[1]))
+    first, second, third = out[:n], out[n : n + n * n].reshape(n, n, -1), out[n + n * n :].reshape(n, n, n, -1)
+    first[:] = z
+    np.multiply(z[:, None], z, out=second)
+    np.multiply(second[:, :, None], z, out=third)
+    for i in range(n):
+        second[i, i] -= 1.0
+        third[i, i] -= z
+        third[i, :, i] -= z
+        third[:, i, i] -= z
+    return out
+
+
+def _with_unit(first: Array) -> Array:
+    """Return the symmetric sum (n, n, n) of products of a vector (n,) and the unit matrix."""
+    one = np.eye(len(first))
+    return np.asarray(one[:, :, None] * first + one[:, None] * first[:, None] + one * first[:, None, None])
+
+
+def _certain(third: Array, chance: float) -> Array:
+    """Return third derivatives without the share of their size that chance explains."""
+    return third * max(0.0, 1.0 - CERTAIN * chance / max(float(np.vdot(third, third)), 1e-300))
 
 
 def _turned(third: Array, A: Array) -> Array:

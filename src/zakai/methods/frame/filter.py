@@ -158,14 +158,14 @@ def density(prepared: Prepared, state: State) -> TensorTrainDensity:
     """Return the density."""
     model = prepared.model
     periodic = tuple(name in model.periodic for name in model.state)
-    return TensorTrainDensity(state.train(prepared.system.periods), model.state, periodic)
+    return TensorTrainDensity(prepared.train(state), model.state, periodic)
 
 
 def step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[State, Info]:
     """Return the state after interval k of the schedule and what is observed at its stop, and what the step reports."""
 
     def check(infinity: bool) -> None:
-        check_escape(prepared, k, lambda: state.train(prepared.system.periods).moments(), infinity)
+        check_escape(prepared, k, lambda: prepared.train(state).moments(), infinity)
 
     if np.isnan(state.cores[0]).any():  # a density that is lost stays lost
         return _lost(state)
@@ -215,7 +215,7 @@ def _step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[tupl
     for factor, missed in prediction.missed:
         own = own.plus(missed.after(prepared.motion.logs(likelihood, missed.mass.points), cov, angles), factor)
     m, P = prediction.mass.unwrapped(angles).moments()
-    root, before, after = root_of(P), root_of(state.train(prepared.system.periods).moments()[1]), root_of(cov)
+    root, before, after = root_of(P), root_of(prepared.train(state).moments()[1]), root_of(cov)
     shift = mean - m
     shift[angles] = wrap(shift[angles])
     errors = control.error.along(np.linalg.solve(root, prediction.slope @ before))
@@ -236,13 +236,14 @@ def _step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[tupl
         "effective_share": updated.effective,
     }
     lost = max(chain.lost, prediction.defect)
+    prepared.recent.train = v
     control = Control(control.interval + 1, time, errors, builder.after())
     return (State.of(v, control), Info(updated.log_evidence, mean, cov, health)), lost
 
 
 def error_of(prepared: Prepared, state: State) -> float:
     """Return the estimated error of the mean of a state, in standard deviations."""
-    return state.control.error.in_deviations(root_of(state.train(prepared.system.periods).moments()[1]))
+    return state.control.error.in_deviations(root_of(prepared.train(state).moments()[1]))
 
 
 def builder_of(prepared: Prepared, state: State) -> Builder:
@@ -265,7 +266,7 @@ def predicted(chain: Chain, state: State, likelihood: Likelihood) -> Predicted:
     found, builder = _predicted(chain, state, likelihood), chain.builder
     mass = found.prediction.mass.unwrapped(chain.prepared.system.base.angles)
     depth = mass.depth(chain.prepared.motion.logs(likelihood, mass.points))
-    if DEEP < depth < math.log(1.0 / builder.rule.tolerance):
+    if depth > DEEP:
         builder.reports.clear()
         builder.sharper = max(math.exp(-depth), SHARPEST)
         found = _predicted(chain, state, likelihood)
@@ -276,7 +277,7 @@ def predicted(chain: Chain, state: State, likelihood: Likelihood) -> Predicted:
 def _predicted(chain: Chain, state: State, likelihood: Likelihood) -> Predicted:
     """Return the prediction over an interval, whose substeps meet the tolerance where a likelihood leads."""
     base, interval, time = chain.prepared.system.base, chain.interval, state.control.time
-    u, length = state.train(chain.prepared.system.periods), interval.stop - interval.start
+    u, length = chain.prepared.train(state), interval.stop - interval.start
     nothing = Error.zero(u.grid.n)
     if length <= 0 or (base.affine and base.sampled and not base.driven):
         prediction, count = chain.first(u, 1)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import NamedTuple
 
@@ -62,12 +62,12 @@ class State(NamedTuple):
 
 
 class Choice(NamedTuple):
-    """A build: its grid, the control points and their counts, the accuracy, the rank, and about which turn angles are (n,)."""
+    """A build: its grid, the control points and their counts, the accuracy, the ranks, and about which turn angles are (n,)."""
 
     grid: Grid
     control: tuple[Array, Array]
     options: Options
-    rank: int
+    ranks: list[int]
     turn: Array
 
 
@@ -106,6 +106,12 @@ class Choices:
         self.made: dict[tuple[tuple[str, ...], int], Made | Choice] = {}
 
 
+class Recent:
+    """The density of the last state of a run, with the moments and points that were computed of it."""
+
+    train: Train | None = None
+
+
 @dataclass(frozen=True)
 class Prepared:
     """A system with its parameters, a schedule and the options."""
@@ -117,6 +123,7 @@ class Prepared:
     most_rank: int
     choices: Choices | None = None
     notes: tuple[str, ...] = ()
+    recent: Recent = field(default_factory=Recent, compare=False, repr=False)
 
     @property
     def model(self) -> Model:
@@ -127,6 +134,11 @@ class Prepared:
     def motion(self) -> Motion:
         """The programs for these parameters."""
         return Motion(self.system, self.theta)
+
+    def train(self, state: State) -> Train:
+        """Return the density of a state."""
+        known = self.recent.train
+        return known if known is not None and known.cores is state.cores else state.train(self.system.periods)
 
     def interval(self, k: int) -> Interval:
         """Return an interval of the schedule."""

@@ -27,7 +27,7 @@ from zakai.numerics.trains.carried import Likelihood
 from zakai.numerics.trains.train import Train
 
 # Points, each with four noises, for a tolerance below this one, and for another: their chance is .2 to .5 of it.
-POINTS, FEWER_POINTS, SMALL = 512, 128, 3e-3
+POINTS, FEWER_POINTS, SMALL = 512, 128, 1e-2
 FEW = 100.0  # effective points that a likelihood must leave, or a power of it is taken
 FLOW = 0.1  # error of a flow in tolerances of a build, as in `Chain`
 LEAST = 0.25  # share of the square of an error that is left when that of the points is subtracted
@@ -71,25 +71,27 @@ def measured(chain: Chain, u: Train, count: int, likelihood: Likelihood) -> Time
     if not np.isfinite(square).all():
         return None
     largest = float(square[: n + n * n].max())
-    return TimeError(count, math.sqrt(largest), Error.of(parts, n)._replace(spread=np.zeros((n, n))))
+    return TimeError(count, math.sqrt(largest), Error.between(parts, n))
 
 
 @dataclass(frozen=True)
 class _Points:
-    """Points x (n, P) at a time t with weights (P,), and the integrals of their log weights (P,)."""
+    """Points x (n, P) at a time t with weights (P,), the integrals of their log weights (P,), and the steps of the last flow."""
 
     chain: Chain
     t: float
     x: Array
     weights: Array
     gained: Array
+    steps: int = 1
 
-    def at(self, t: float) -> _Points:
-        """Return the points after the flow to a time, in as many Runge-Kutta steps as the filter would take."""
+    def at(self, t: float, steps: int | None = None) -> _Points:
+        """Return the points after the flow to a time, in so many Runge-Kutta steps, or as many as the filter would take."""
         motion, interval, values = self.chain.prepared.motion, self.chain.interval, self.chain.values
-        steps = motion.steps(interval, self.x, (self.t, t), values, FLOW * self.chain.builder.rule.tolerance)
+        if steps is None:
+            steps = motion.steps(interval, self.x, (self.t, t), values, FLOW * self.chain.builder.rule.tolerance)
         x, gained = motion.ends(self.x, motion.path(interval, self.t, t, values, steps))
-        return replace(self, t=t, x=x, gained=self.gained + gained)
+        return replace(self, t=t, x=x, gained=self.gained + gained, steps=steps)
 
     def noise(self, length: float) -> tuple[Array, Array]:
         """Return the noise (n, n) of a substep about its middle, and df/dx (n, n), as `Chain` takes them."""
@@ -123,7 +125,8 @@ def _moved(chain: Chain, before: Mass, count: int) -> list[tuple[Array, Array]]:
     substep = _kicked if chain.prepared.system.kicked else _noisy
     for j in range(count):
         coarse, fine = substep(coarse.at(interval.start + (j + 0.5) * length), fine, length, rng)
-    return [(part.x, part.gained) for part in (coarse.at(interval.stop), fine.at(interval.stop))]
+    coarse = coarse.at(interval.stop)
+    return [(part.x, part.gained) for part in (coarse, fine.at(interval.stop, coarse.steps))]
 
 
 def _halves(rng: np.random.Generator, rows: int, number: int) -> list[tuple[float, Array]]:
@@ -143,7 +146,7 @@ def _noisy(coarse: _Points, fine: _Points, length: float, rng: np.random.Generat
     Q, A = coarse.noise(length)
     C, both, P = 0.25 * length * A, np.zeros_like(fine.x), np.zeros_like(Q)
     for sign, normals in _halves(rng, n, points // 4):
-        fine = fine.at(coarse.t + 0.25 * sign * length)
+        fine = fine.at(coarse.t + 0.25 * sign * length, coarse.steps)
         half, _ = fine.noise(0.5 * length)
         scale, root = _root(half)
         noise = scale * (root @ normals)
@@ -157,7 +160,7 @@ def _kicked(coarse: _Points, fine: _Points, length: float, rng: np.random.Genera
     """Return what `_noisy` returns, for noise that depends on the state."""
     kicks, total = len(coarse.chain.prepared.motion.kicks(coarse.chain.interval, coarse.t, length)), 0.0
     for sign, normals in _halves(rng, kicks, fine.x.shape[1] // 4):
-        fine, total = fine.at(coarse.t + 0.25 * sign * length).kicked(0.5 * length, normals), total + normals
+        fine, total = fine.at(coarse.t + 0.25 * sign * length, coarse.steps).kicked(0.5 * length, normals), total + normals
     return coarse.kicked(length, math.sqrt(0.5) * total), fine
 
 

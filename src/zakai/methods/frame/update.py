@@ -19,7 +19,7 @@ from zakai.numerics.trains.train import Train
 
 FEW = 30.0  # effective points of the prediction that a likelihood must leave, or powers of it are taken
 MOST_POWERS = 24  # an observation sixty deviations away needs fifteen
-DEPTH_POINTS = 128
+DEPTH_POINTS, APART = 128, 3  # an odd distance leaves quasi-random points evenly spread
 ROUGHLY = 0.01  # relative error that densities between powers of a likelihood need: they only show where the mass is
 OFF_CENTRE, NARROW, WIDE = 0.5, 0.6, 1.6  # shift and deviation of a density in its frame, from which it gets another frame
 LOST = 3.0  # shift in that other frame, from which the density is in a corner of its box
@@ -83,6 +83,8 @@ def _product(
     builder: Builder, prediction: Prediction, mass: Mass, likelihood: Likelihood, power: float, loose: float
 ) -> tuple[Train, float]:
     """Return the prediction times a power of the likelihood over its largest value on the mass, and the log of that value."""
+    if not np.isfinite(mass.weights).all():
+        raise Unresolved("the density has no mass on the way to the observation")
     logs = builder.prepared.motion.logs(likelihood, mass.points)
     top = power * float(np.max(logs[mass.weights > 1e-3 * mass.weights.max()]))
     function = prediction.function.times(likelihood._replace(power=power, top=top))
@@ -118,7 +120,6 @@ def _in_frame(v: Train) -> tuple[Array, Array]:
 def depth_of(u: Carried, mass: Mass, posterior: Train, tolerance: float) -> float:
     """Return log(max u / u) where the posterior is, of a prediction known to a share of max u; zero for equal Gaussians."""
     points, weights = posterior.cloud(DEPTH_POINTS)
-    values = u(np.concatenate([points, mass.points], axis=1))
+    values = u(np.concatenate([points, mass.points[:, ::APART]], axis=1))
     values = np.where(values > 0, values, tolerance * values.max())  # no more is known of it where it is not positive
-    count, n = len(weights), len(points)
-    return float(math.log(values[count:].max()) - weights @ np.log(values[:count]) - 0.5 * n)
+    return float(math.log(values.max()) - weights @ np.log(values[:DEPTH_POINTS]) - 0.5 * len(points))

@@ -68,7 +68,7 @@ class WeakPoints:
 
     def _steps(self, mass: Mass, scale: Array, c: Array) -> int:
         """Return the Runge-Kutta steps of the largest kick."""
-        points, steps = mass.points[:, ::64], 1
+        points, steps = mass.points[:, ::63], 1
         last = self._ends(points, c, 1)
         while steps < MOST_STEPS:
             finer = self._ends(points, c, 2 * steps)

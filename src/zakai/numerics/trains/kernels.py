@@ -352,13 +352,14 @@ def draw(packed: Any, right: Array, share: Array, flat: bool, out: Array) -> Non
             out[k, p] = j + min(max((u - before) / (chosen[j] + 1e-300), 0.0), 1.0) - 0.5
             likely *= w[j] / (total + 1e-300)
             drawn *= root[j] / (root_total + 1e-300)
+            next_v[:b] = 0.0
+            for s in range(a):
+                base, factor = offsets[k] + (j * a + s) * b, v[s]
+                for q in range(b):
+                    next_v[q] += factor * cores[base + q]
             top = 0.0
             for q in range(b):
-                t = 0.0
-                for s in range(a):
-                    t += v[s] * cores[offsets[k] + (j * a + s) * b + q]
-                next_v[q] = t
-                top = max(top, abs(t))
+                top = max(top, abs(next_v[q]))
             for q in range(b):
                 v[q] = next_v[q] / (top + 1e-300)
         out[n, p] = likely
@@ -379,11 +380,10 @@ def values_on_grid(packed: Any, index: Array, out: Array) -> None:
         for k in range(n):
             a, b = ranks[k], ranks[k + 1]
             base = offsets[k] + index[p, k] * a * b
-            for q in range(b):
-                t = 0.0
-                for s in range(a):
-                    t += v[s] * cores[base + s * b + q]
-                next_v[q] = t
+            next_v[:b] = 0.0
+            for s in range(a):
+                for q in range(b):
+                    next_v[q] += v[s] * cores[base + s * b + q]
             for q in range(b):
                 v[q] = next_v[q]
         out[p] = v[0]

@@ -190,26 +190,27 @@ class Train:
         return self.grid.x_of(z), out[n:]
 
     def cloud(self, count: int) -> tuple[Array, Array]:
-        """Return weighted points of the mass (n, P) with their weights (P,).
+        """Return points of the mass (n, P) with weights (P,), sums over which are integrals of the normalised train.
 
-        Half are draws, half draws of conditional laws in proportion to their square roots, weighted as draws of the mixture:
-        parts with little mass, and tails, have points too.
+        Half of an even `count` are draws, half draws of conditional laws in proportion to their square roots: parts with little
+        mass, and tails, have points too.  They are weighted as draws of the mixture, by the values of the train where they are:
+        with the masses of the cells instead a point in the steep tail of a ridge counts too much, and its error is taken for one
+        of the mean.  The weights are NaN where the train is positive at none of the points, or infinite.
         """
-        x, likely, drawn = self._proposed(count)
-        # The square roots of an axis with no mass are drawn nowhere; both probabilities are zero there.
-        weights = likely / np.maximum(0.5 * likely + 0.5 * drawn, 1e-300)
-        weights = weights / weights.sum()
-        return self._with_moments(x, weights), weights
+        if count not in self._clouds:
+            x, likely, drawn = self._proposed(count)
+            values = np.maximum(self.evaluate(x), 0.0)
+            top = float(values.max())
+            values = values / top if 0.0 < top < math.inf else np.full(count, np.nan)
+            weights = values / np.maximum(likely + drawn, 1e-300)
+            weights = weights / weights.sum()
+            self._clouds[count] = self._with_moments(x, weights), weights
+        return self._clouds[count]
 
-    def quadrature(self, count: int) -> tuple[Array, Array]:
-        """Return points (n, P) with weights (P,), sums over which are integrals of the normalised train; `count` is even.
-
-        The points are those of `cloud`, weighted by the values of the train where they are, not by the masses of the cells.
-        """
-        x, likely, drawn = self._proposed(count)
-        weights = np.maximum(self.evaluate(x), 0.0) / np.maximum(likely + drawn, 1e-300)
-        weights = weights / weights.sum()
-        return self._with_moments(x, weights), weights
+    @cached_property
+    def _clouds(self) -> dict[int, tuple[Array, Array]]:
+        """The clouds that were drawn, by their numbers of points."""
+        return {}
 
     def _proposed(self, count: int) -> tuple[Array, Array, Array]:
         """Return draws x (n, P), half by each law of `draw`, and their probabilities (P,) in both."""
