@@ -23,6 +23,7 @@ from zakai.studio.worker import answer as computed
 
 SPIRAL = zakai.gallery.text("spiral-sensor")
 SIMULATED = {"kind": "simulate", "until": 1.0, "step": 0.02, "seed": 1}
+LONG = {"text": zakai.gallery.text("lorenz"), "data": {"kind": "simulate", "until": 200.0, "step": 0.01, "seed": 0}}
 
 
 @pytest.fixture(scope="module")
@@ -134,6 +135,39 @@ def test_the_newest_of_several_requests_is_answered(page: Page):
     while not answered or answered[-1] != last:
         answered.append(page.receive()["id"])
     assert len(answered) < 20
+
+
+def test_what_a_page_asked_for_ends_when_the_page_is_gone_and_goes_on_when_it_comes_back(monkeypatch):
+    """A page that comes back in time finds its process, with the results that are kept there."""
+    monkeypatch.setattr("zakai.studio.server.RELOAD", 1.0)
+    client, token = studio()
+    address = f"/{token}/socket"
+    with client:
+        runner = client.studio.runner
+        with client.websocket_connect(address, headers={"host": HOST, "origin": ORIGIN}) as socket:
+            before = Page(client, token, socket)
+            before.ask("run", text=SPIRAL, data=SIMULATED, name="main")
+        with client.websocket_connect(address, headers={"host": HOST, "origin": ORIGIN}) as socket:
+            again = Page(client, token, socket)
+            time.sleep(2.5)
+            assert again.ask("picture", name="main")["frame"].size > 1000
+            again.send("run", **LONG, method="yau-yau", name="other")
+            while not runner.running:
+                time.sleep(0.1)
+        ends = time.monotonic() + 20.0
+        while runner.running and time.monotonic() < ends:
+            time.sleep(0.1)
+        assert runner.running is None
+
+
+def test_what_waits_is_answered_when_it_is_cancelled(page: Page):
+    page.send("run", **LONG, method="yau-yau")
+    waiting = page.send("predicted", name="main")
+    time.sleep(0.5)
+    page.send("cancel")
+    while (answer := page.receive())["id"] != waiting:
+        pass
+    assert answer["cancelled"]
 
 
 def test_a_run_is_cancelled_and_the_next_request_is_answered(page: Page):
