@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import re
 import signal
@@ -17,9 +18,12 @@ from starlette.websockets import WebSocketDisconnect
 
 import zakai
 from studio.page import HOST, ORIGIN, PORT, Page, studio, unpacked
+from zakai import _progress
+from zakai.numerics import compiled
 from zakai.studio.follow import Source
 from zakai.studio.session import Session
 from zakai.studio.worker import answer as computed
+from zakai.studio.worker import saying
 
 SPIRAL = zakai.gallery.text("spiral-sensor")
 SIMULATED = {"kind": "simulate", "until": 1.0, "step": 0.02, "seed": 1}
@@ -235,6 +239,30 @@ print(answer(session, {"id": 1, "do": "large"}, 2.0, None), not session.results)
 """
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert "more memory than it may have (2 GiB)" in done.stdout and "--memory" in done.stdout and "True" in done.stdout
+
+
+def test_a_task_says_that_kernels_are_compiled_while_they_are_and_what_takes_long():
+    said: list[str] = []
+    with saying(said.append):
+        with compiled._compilation:
+            time.sleep(1.5)
+        time.sleep(0.5)
+        logging.getLogger("zakai").warning("fit takes about %d s more", 20)
+    compiling = "Kernels are being compiled, once for this machine; this takes up to a minute."
+    assert said == [compiling, "", "fit takes about 20 s more"]
+    said.clear()
+    with saying(said.append):
+        time.sleep(1.5)
+    logging.getLogger("zakai").warning("afterwards")
+    assert said == []
+
+
+def test_a_profile_says_how_long_it_takes(monkeypatch, caplog, tmp_path):
+    monkeypatch.setattr(_progress, "FIRST", 0.01)
+    text = SPIRAL.replace('"t/40 * x"', '"-a*x"') + "[parameters]\na = 1.0\n"
+    request = {"do": "profile", "text": text, "data": SIMULATED, "parameter": "a", "low": 0.5, "high": 2.0, "count": 5}
+    computed(Session(tmp_path), request, 4.0, lambda *_: time.sleep(0.02))
+    assert re.search(r"the profile of a takes (at most )?about \d+ to \d+ s more", caplog.text)
 
 
 def test_a_worker_that_the_system_ends_is_replaced(served, page: Page):

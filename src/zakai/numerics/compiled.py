@@ -102,6 +102,11 @@ def compiling() -> bool:
     return bool(global_compiler_lock.is_locked())
 
 
+def compiles_since() -> float | None:
+    """Return when the compilation began, by `time.monotonic`, with which any thread is busy now; None where none is."""
+    return _compilation.clock[1]
+
+
 def working_time() -> float:
     """Return a clock in seconds that does not count the compilation of kernels."""
     return time.monotonic() - _compilation.seconds()

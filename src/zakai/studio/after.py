@@ -160,6 +160,7 @@ def fit(session: Session, request: Mapping[str, Any], report: Report) -> Answer:
 
 def profile(session: Session, request: Mapping[str, Any], report: Report) -> Answer:
     """Return the log-likelihood as a function of one parameter, the others as they are, around its maximum in an interval."""
+    from zakai._progress import announced
     from zakai.engine.driver import filter as run_filter
 
     model = session.model(request)
@@ -181,14 +182,17 @@ def profile(session: Session, request: Mapping[str, Any], report: Report) -> Ans
             return float(run_filter(there, found.record, method, keep="moments", **options).log_likelihood)
         except ZakaiError:  # such as a noise that is not positive there
             return float("nan")
+        finally:
+            announce(done, -(-done // count) * count, NARROWED * count)
 
-    for _ in range(NARROWED):
-        values = np.linspace(low, high, count)
-        heights = np.array([height(float(value)) for value in values])
-        high_enough = np.flatnonzero(heights >= np.nanmax(heights, initial=-np.inf) - SEEN)
-        if len(high_enough) == 0 or len(high_enough) >= count // 2:
-            break
-        low, high = values[max(0, high_enough[0] - 1)], values[min(count - 1, high_enough[-1] + 1)]
+    with announced(f"the profile of {name}") as announce:
+        for _ in range(NARROWED):
+            values = np.linspace(low, high, count)
+            heights = np.array([height(float(value)) for value in values])
+            high_enough = np.flatnonzero(heights >= np.nanmax(heights, initial=-np.inf) - SEEN)
+            if len(high_enough) == 0 or len(high_enough) >= count // 2:
+                break
+            low, high = values[max(0, high_enough[0] - 1)], values[min(count - 1, high_enough[-1] + 1)]
     if not np.isfinite(heights).any():
         raise InputError(f"profile: there is no log-likelihood for {name} from {low:g} to {high:g}; take other ends")
     return {"parameter": name}, {"values": values, "log_likelihood": heights}

@@ -224,7 +224,7 @@ class Studio {
   async task(what, said, request) {
     if (this.running) { this.say(`${this.said} It has not ended; press Cancel to end it.`); return null; }
     this.busy(true, said);
-    const found = await this.ask(what, request, { progress: (done, total) => this.progressed(done, total) });
+    const found = await this.ask(what, request, { progress: (done, total) => this.progressed(done, total), said: (text) => this.say(`${said} ${text}`) });
     this.busy(false);
     return found;
   }
@@ -237,25 +237,16 @@ class Studio {
     document.body.classList.toggle("busy", on);
     if (on) { this.cancelling = false; this.say(said); }
     if (!on && this.again) { this.again = false; setTimeout(() => this.run()); } // what was wanted meanwhile
-    clearTimeout(this.patience);
-    this.compiling = "";
-    if (on) this.patience = setTimeout(() => {
-      if (!this.running || this.reported) return;
-      this.compiling = said;
-      this.say(`${said} The first run on a machine compiles kernels, which takes up to a minute.`);
-    }, 6000);
   }
 
   progressed(done, total) {
     const bar = byId("progress");
     bar.classList.toggle("open", !total);
-    this.reported = Boolean(total);
     if (total) {
       const share = Math.round((100 * done) / total);
       bar.setAttribute("aria-valuenow", share);
       bar.firstElementChild.style.width = `${share}%`;
       bar.title = `${done.toLocaleString("en")} of ${total.toLocaleString("en")}`;
-      if (this.compiling) { this.say(this.compiling); this.compiling = ""; }
     } else { bar.removeAttribute("aria-valuenow"); bar.title = ""; }
   }
 

@@ -16,9 +16,11 @@ class Lazy {
     const { studio } = this;
     if (!studio.summary || this.seen === studio.summary || studio.running) return;
     this.seen = studio.summary;
-    this.panel.replaceChildren(h("p", { class: "small" }, "Computing the laws of the observations …"));
+    const now = "Computing the laws of the observations …", line = h("p", { class: "small" }, now);
+    this.panel.replaceChildren(line);
     try {
-      const found = await studio.ask(this.what, { name: "main" }, { quiet: true, work: true, progress: (done, total) => studio.progressed(done, total) });
+      const found = await studio.ask(this.what, { name: "main" }, { quiet: true, work: true, progress: (done, total) => studio.progressed(done, total),
+        said: (text) => { line.textContent = `${now} ${text}`; } });
       if (found) this.draw(found); else this.seen = null;
     } catch (error) {
       this.panel.replaceChildren(h("p", { class: error.cancelled ? "small" : "fault" }, error.cancelled ? "Cancelled; press Run to compute again." : error.message));
