@@ -60,6 +60,14 @@ class Clock(NamedTuple):
         apart = whole.astype(np.int64) * size + np.round((times - whole) * (size / step)).astype(np.int64) * step
         return np.asarray(self.origin + apart.astype("timedelta64[ns]"))
 
+    def text(self, time: float) -> str:
+        """Return the date of one time as text, to the second or, where it is not whole, to the digits that it needs."""
+        step = "ms" if _NANOSECONDS[self.unit] >= _SECOND else "ns"
+        half = np.timedelta64(_NANOSECONDS[step] // 2, "ns")  # so that it is rounded
+        date = (self.dates(np.array([time], float))[0] + half).astype(f"datetime64[{step}]")
+        seconds, _, fraction = str(date).replace("T", " ").partition(".")
+        return f"{seconds}.{fraction.rstrip('0')}".rstrip(".")
+
     def days(self, times: Any) -> Any:
         """Return the times as numbers of days since 1970, which Matplotlib draws as dates."""
         start = self.origin.astype("datetime64[ns]").astype(np.int64) / _NANOSECONDS["d"]
