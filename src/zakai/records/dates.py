@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import datetime
+import re
+from collections.abc import Iterable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -23,6 +25,9 @@ _NANOSECONDS = {
     "year": 31557600 * _SECOND,  # 365.25 days
 }
 _OTHER_NAMES = {"D": "d", "H": "h", "W": "week", "Y": "year", "day": "d", "hour": "h", "minute": "min", "second": "s"}
+
+
+_TIME = re.compile(r"\bt = ([-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?)(?![\d*/])")
 
 
 class Clock(NamedTuple):
@@ -72,6 +77,13 @@ class Clock(NamedTuple):
         """Return the times as numbers of days since 1970, which Matplotlib draws as dates."""
         start = self.origin.astype("datetime64[ns]").astype(np.int64) / _NANOSECONDS["d"]
         return start + np.asarray(times, float) * (_NANOSECONDS[self.unit] / _NANOSECONDS["d"])
+
+
+def dated(sentences: Iterable[str], clock: Clock | None) -> list[str]:
+    """Return sentences with dates in place of times, where there is a clock: `t = 1.5` becomes `2024-03-31 12:00:00`."""
+    if clock is None:
+        return list(sentences)
+    return [_TIME.sub(lambda found: clock.text(float(found[1])), one) for one in sentences]
 
 
 def unit_name(unit: Any, what: str = "record") -> str:
