@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from copy import copy
 
 import numpy as np
 
@@ -64,9 +65,17 @@ def result_of_run(run: Run, why: str, considered: Mapping[str, tuple[Condition, 
     undefined += notes_on_domain(noted, theta, record, result, method.reflects)
     undefined += notes_on_escape(method.name, noted, schedule, theta, result.mean, result.cov)
     lengths = notes_on_lengths(schedule, distances)
-    misfit = notes_on_law(noted, theta, schedule, run.values, infos)
-    result.warnings.extend([*undefined, *run.notes, *lengths, *misfit, *run.health_warnings(result)])
+    misfit, first = notes_on_law(noted, theta, schedule, run.values, infos, (result.bounds, method.losses))
+    result.warnings.extend([*undefined, *run.notes, *lengths, *misfit, *run.health_warnings(_until(result, first))])
     return run.complete(result)
+
+
+def _until(result: FilterResult, first: int) -> FilterResult:
+    """Return the result without the figures from observation `first` on, which its note has."""
+    found = copy(result)
+    known = np.arange(len(result.times)) <= first
+    found.health = {name: np.where(known, figures, np.nan) for name, figures in result.health.items()}
+    return found
 
 
 def _with_start(errors: np.ndarray | None) -> np.ndarray | None:
