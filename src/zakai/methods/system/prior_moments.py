@@ -59,8 +59,17 @@ def prior_moments(model: Model, prior: Any, theta: np.ndarray) -> tuple[np.ndarr
 
 
 def density_grid(model: Model, prior: DensityPrior, theta: np.ndarray, tolerance: float = 1e-12) -> PriorGrid:
-    """Return a grid for a prior that is given by the logarithm of its density, at the real part of `theta` (p,)."""
-    log_density = numpy_function(prior.log_density, model)
+    """Return a grid for a prior that is given by the logarithm of its density, at the real part of `theta` (p,).
+
+    The density of several states counts inside of the domain only.
+    """
+    formula, ends = numpy_function(prior.log_density, model), model.domain if model.n > 1 else {}
+
+    def log_density(x: np.ndarray, t: float, theta: np.ndarray) -> np.ndarray:
+        inside = [interval.contains(x[:, model.state.index(name)]) for name, interval in ends.items()]
+        values = formula(x, t, theta)
+        return np.where(np.all(inside, axis=0), values, -np.inf) if inside else values
+
     periodic = [name in model.periodic for name in model.state]
     source = f"{model.source}: prior: log_density"
     return prior_grid(lambda x: log_density(x, model.start, theta.real), model.n, periodic, tolerance=tolerance, source=source)
