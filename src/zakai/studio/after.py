@@ -103,10 +103,7 @@ def residuals(session: Session, request: Mapping[str, Any], report: Report) -> A
                 "count": count,
                 "heights": (np.histogram(one.u, BINS, (0.0, 1.0))[0] * BINS / count).tolist(),
                 "band": [float(low), float(high)],
-                "uniformity": one.uniformity,
-                "variance": one.variance,
-                "independence": one.independence,
-                "power": float(np.mean(one.scores**2)),
+                "readings": one.readings(),
                 "autocorrelation": one.autocorrelation.tolist(),
             }
         )
