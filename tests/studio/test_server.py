@@ -449,3 +449,15 @@ def test_a_record_is_kept_while_the_model_changes(page: Page, tmp_path):
     assert zakai.load_result(tmp_path / "result.nc").log_likelihood == answer["log_likelihood"]
     said = page.ask("run", text=zakai.gallery.text("kalman-bucy-1d"), data=data)["error"]
     assert "press Simulate again" in said
+
+
+def test_pictures_of_a_record_with_dates_count_in_dates(page: Page):
+    """As the density does: the record, its observations with their predictions, and the residuals."""
+    rows = "".join(f"2025-03-30 {8 + k // 4:02d}:{15 * (k % 4):02d},{0.1 * (k % 5)},0.2\n" for k in range(20))
+    number = page.upload(f"time,a,b\n{rows}".encode()).json()["file"]
+    data = {"kind": "file", "file": number, "name": "dates.csv", "columns": ["a", "b"], "unit": "h", "origin": "2025-03-30T07:00"}
+    page.ask("run", text=SPIRAL, data=data, name="main")
+    origin = (np.datetime64("2025-03-30T07:00") - np.datetime64("1970-01-01")) / np.timedelta64(1, "ms")
+    described = page.ask("describe", text=SPIRAL, data=data)
+    for answer in (described, page.ask("predicted", name="main"), page.ask("residuals", name="main")):
+        assert answer["clock"] == pytest.approx({"origin": origin, "unit": 3600e3})

@@ -9,6 +9,7 @@ import numpy as np
 
 from zakai.errors import InputError, ZakaiError
 from zakai.models.clock import clock
+from zakai.report.charts import clock_header
 from zakai.studio.running import method_of, rows_of, summary
 from zakai.studio.session import Answer, Held, Report, Session
 
@@ -76,7 +77,8 @@ def predicted(session: Session, request: Mapping[str, Any], report: Report) -> A
     seen = np.isfinite(record.values)
     outside = float(np.mean(((record.values < low) | (record.values > high))[seen])) if seen.any() else None
     names = list(result.model.observation_names) if result.model is not None else []
-    return {"names": names, "outside": outside, "before": first, "rates": record.kind == "increments"}, arrays
+    about = {"names": names, "outside": outside, "before": first, "rates": record.kind == "increments"}
+    return {**about, "clock": clock_header(record.clock)}, arrays
 
 
 def residuals(session: Session, request: Mapping[str, Any], report: Report) -> Answer:
@@ -111,7 +113,7 @@ def residuals(session: Session, request: Mapping[str, Any], report: Report) -> A
         arrays[f"scores{len(found) - 1}"] = one.scores.astype(np.float32)
     if not found:
         raise InputError("residuals: fewer than five observations have one; take a longer record")
-    return {"observations": found, "before": first}, arrays
+    return {"observations": found, "before": first, "clock": clock_header(result.clock)}, arrays
 
 
 def compare(session: Session, request: Mapping[str, Any], report: Report) -> Answer:
