@@ -296,7 +296,7 @@ def test_a_file_that_grows_is_filtered_row_by_row(tmp_path):
         while answer["count"] < 30:
             answer = page.receive()
         result = zakai.filter(model, record)
-        assert answer["mean"] == pytest.approx(result.mean[-1], rel=1e-9)
+        assert answer["mean"] == pytest.approx(result.mean[-1], rel=1e-9) and answer["method"] == result.method
         assert page.ask("picture", name="stream")["frame"].size > 1000
 
 
