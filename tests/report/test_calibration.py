@@ -44,8 +44,8 @@ def test_one_outlier_is_no_verdict_on_the_model(after):
     z = np.random.default_rng(0).normal(size=90)
     z[40] = 30.0
     z[41 : 41 + after] = -5.5
-    readings = calibration_of(np.arange(90.0), norm.cdf(z)).readings()
-    said = [said for _, _, said, _ in readings]
+    verdicts = calibration_of(np.arange(90.0), norm.cdf(z)).verdicts()
+    said = [said for _, _, said, _ in verdicts]
     expected = "one outlier" if not after else "3 outliers"
     assert f"{expected} beyond 4 deviations; the others are consistent with the model" in said
     assert not any("noise" in one or "dynamics" in one for one in said)

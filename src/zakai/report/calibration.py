@@ -40,7 +40,7 @@ class Calibration(NamedTuple):
     variance: float
     independence: float
 
-    def readings(self) -> list[tuple[str, str, str, bool]]:
+    def verdicts(self) -> list[tuple[str, str, str, bool]]:
         """Return for each test its name, its p-value, what that says, and whether it speaks against the model."""
         power = float(np.mean(self.scores**2))
         tests = [
@@ -70,7 +70,7 @@ class Calibration(NamedTuple):
         """Return the tests as a table, with what a small p-value says."""
         cells = "".join(
             f'<tr><td>{name}</td><td class="number">{p}</td><td class="{"fails" if fails else "open"}">{said}</td></tr>'
-            for name, p, said, fails in self.readings()
+            for name, p, said, fails in self.verdicts()
         )
         return f"<table><thead><tr><th>Test</th><th>p-value</th><th>Reading</th></tr></thead><tbody>{cells}</tbody></table>"
 

@@ -105,7 +105,7 @@ def residuals(session: Session, request: Mapping[str, Any], report: Report) -> A
                 "count": count,
                 "heights": (np.histogram(one.u, BINS, (0.0, 1.0))[0] * BINS / count).tolist(),
                 "band": [float(low), float(high)],
-                "readings": one.readings(),
+                "verdicts": one.verdicts(),
                 "autocorrelation": one.autocorrelation.tolist(),
             }
         )

@@ -25,7 +25,7 @@ from zakai.studio.frames import ENVELOPE, packed
 from zakai.studio.session import Session
 from zakai.studio.tasks import carried_out
 
-WATCHED = 0.25  # seconds between looks whether a kernel is compiled
+WATCHED = 0.25  # seconds between checks whether a kernel is compiled
 COMPILED = 1.0  # seconds of a compilation after which it is said
 COMPILING = "Kernels are being compiled, once for this machine; this takes up to a minute."
 FULL = "the computation needs more memory than it may have ({:g} GiB): take a shorter record or a larger tolerance, or start "

@@ -64,7 +64,7 @@ export class Residuals extends Lazy {
       const histogram = h("div", {}), scores = h("div", {}), lags = h("div", {});
       this.panel.append(h("h3", {}, one.name), h("div", { class: "pair" }, h("figure", {}, histogram, h("figcaption", {}, "probability integral transforms")), h("figure", {}, lags, h("figcaption", {}, "autocorrelation of the normal scores"))),
         h("figure", {}, scores, h("figcaption", {}, "normal scores over time")),
-        table(["test", "p-value", "reading"], one.readings.map(([name, p, said]) => [name, p, said])));
+        table(["test", "p-value", "reading"], one.verdicts.map(([name, p, said]) => [name, p, said])));
       new BarPanel(histogram, { label: `Histogram of ${one.name}`, height: 190, compact: true, testid: `pit-${one.name}` }).show({ heights: one.heights, band: one.band, level: 1, x: { title: "probability" }, y: { title: "density" } });
       const count = one.autocorrelation.length, bound = 1.96 / Math.sqrt(one.count), most = Math.max(0.3, ...one.autocorrelation.map(Math.abs));
       new BarPanel(lags, { label: "Autocorrelation", height: 190, compact: true }).show({ heights: one.autocorrelation, low: 0.5, high: count + 0.5, band: [-bound, bound], level: 0, x: { title: "lag" }, y: { title: "correlation" }, range: [-1.1 * most, 1.1 * most] });
