@@ -15,7 +15,7 @@ from zakai.engine.versions import versions
 from zakai.methods._protocol import joined
 from zakai.notes.escape import notes_on_escape
 from zakai.notes.lengths import distances_of_lengths, notes_on_lengths
-from zakai.notes.misfit import notes_on_law
+from zakai.notes.misfit import OF_START, notes_on_law
 from zakai.notes.model import notes_on_domain, notes_on_formulas
 
 
@@ -74,7 +74,7 @@ def _until(result: FilterResult, first: int) -> FilterResult:
     """Return the result without the figures from observation `first` on, which its note has."""
     found = copy(result)
     known = np.arange(len(result.times)) <= first
-    found.health = {name: np.where(known, figures, np.nan) for name, figures in result.health.items()}
+    found.health = {name: np.where(known | (name in OF_START), figures, np.nan) for name, figures in result.health.items()}
     return found
 
 

@@ -22,6 +22,7 @@ from zakai.records.schedule import Schedule
 
 Array = NDArray[np.float64]
 Losses = Mapping[str, float]
+OF_START = ("start_error",)  # figures of the prior, which no observation explains
 LARGEST = 200.0  # nats of a coordinate: 20 standard deviations
 AT_ONCE = 32  # rows in which the mode of a log density is searched together
 ROUNDS, CLOSE = 60, 0.5  # of that search: the most rounds, and the gain in nats that ends it
@@ -124,6 +125,8 @@ def _consequences(infos: Infos, judged: tuple[Bounds, Losses], times: Array, fir
     later = {name: np.asarray(figures, float)[first:] for name, figures in infos.health.items()}
     lost = any((later[name] > limit).any() for name, limit in losses.items() if name in later)
     over = []
+    for name in OF_START:
+        later.pop(name, None)
     for name, bound in {**losses, **{name: bound for name, (bound, _) in bounds.items()}}.items():
         count = int((later[name] > bound).sum()) if name in later else 0
         if count:
