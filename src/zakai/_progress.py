@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator
@@ -33,7 +34,7 @@ def shown() -> bool:
 
 @contextmanager
 def announced(what: str) -> Iterator[Callable[[float, float, float], None]]:
-    """Log that work takes more than `FIRST` seconds, if it does, and how long the rest takes, as soon as that is known.
+    """Log that work takes more than `FIRST` seconds, if the rest does, too, and how long that takes, as soon as it is known.
 
     Yields a function of the parts of the work that are done, and of the fewest and the most that there usually are in all; the
     rest is estimated from the time between its calls.
@@ -43,7 +44,7 @@ def announced(what: str) -> Iterator[Callable[[float, float, float], None]]:
         yield work.advance
     finally:
         _WITHIN.reset(before)
-        work.timer.cancel()
+        work.end()
 
 
 def within_announced() -> bool:
@@ -51,22 +52,42 @@ def within_announced() -> bool:
     return _WITHIN.get()
 
 
+def _clock() -> float:
+    """Return a time in seconds that does not count the compilation of kernels, where that is imported."""
+    compiled = sys.modules.get("zakai.numerics.compiled")
+    return float(getattr(compiled, "working_time", time.monotonic)())
+
+
 class _Announced:
     def __init__(self, what: str):
-        self.what, self.known, self.lock, self.said = what, "", Lock(), False
-        self.began, self.first = time.monotonic(), (0.0, 0.0)
-        self.timer = Timer(FIRST, self._announce)
+        self.what, self.known, self.lock, self.said, self.ended = what, "", Lock(), False, False
+        self.began, self.first, self.most = _clock(), (0.0, 0.0), math.inf
+        self._wait(FIRST)
+
+    def _wait(self, seconds: float) -> None:
+        self.timer = Timer(seconds, self._announce)
         self.timer.daemon = True
         self.timer.start()
 
+    def end(self) -> None:
+        with self.lock:
+            self.ended = True
+            self.timer.cancel()
+
     def _announce(self) -> None:
         with self.lock:
-            self.said = bool(self.known)
-            _LOG.warning("%s takes %s", self.what, self.known or f"more than {FIRST:.0f} s")
+            rest = FIRST - (_clock() - self.began)  # kernels were compiled meanwhile
+            if self.ended:
+                return
+            if rest > 0.01:
+                self._wait(rest)
+            elif self.most > FIRST:
+                self.said = bool(self.known)
+                _LOG.warning("%s takes %s", self.what, self.known or f"more than {FIRST:.0f} s")
 
     def advance(self, done: float, fewest: float, most: float) -> None:
         """Note how much is done; log how long the rest takes, where only the beginning was announced."""
-        now = time.monotonic()
+        now = _clock()
         if not self.first[1]:
             self.first = now, done
         # The first part waits for what is prepared and compiled.
@@ -75,6 +96,7 @@ class _Announced:
         about = "at most about" if alone else "about"
         low, high = (rate * max(count - done, 0) for count in (fewest, most))
         with self.lock:
+            self.most = high
             self.known = f"{about} {high:.0f} s more" if fewest == most else f"{about} {low:.0f} to {high:.0f} s more"
             if now - self.began > FIRST and not self.said and high > FIRST and not alone:
                 self.said = True
@@ -107,11 +129,11 @@ def counting(what: str, total: int, progress: Progress | None) -> Iterator[Calla
     """Yield a function that passes the items of an iterable on and counts them, in all iterables that it is given.
 
     Args:
-        what: the words before the bar.
+        what: the words before the bar, and of the announcement where it takes long.
         total: the number of all items.
         progress: called with the number of items done and `total`; without it long work has a bar on a terminal.
     """
-    with bar(what) if progress is None else nullcontext(progress) as advance:
+    with bar(what) if progress is None else nullcontext(progress) as advance, announced(what) as announce:
         done = 0
 
         def counted(items: Iterable[T]) -> Iterator[T]:
@@ -119,6 +141,7 @@ def counting(what: str, total: int, progress: Progress | None) -> Iterator[Calla
             for item in items:
                 yield item
                 done += 1
+                announce(done, total, total)
                 if advance is not None:
                     advance(done, total)
 

@@ -205,3 +205,22 @@ def test_columns_that_go_by_position_are_named_before_the_record_is_filtered(zak
 def test_reproduce_without_a_name_lists_the_names(zakai):
     listed = zakai("reproduce")
     assert listed.code == 0 and "chen-luo-yau-2017" in listed.out.split() and "tracking" in listed.out.split()
+
+
+def test_a_forecast_of_a_record_with_dates_takes_and_shows_dates(zakai, tmp_path):
+    (tmp_path / "dates.csv").write_text("time,y1\n2025-03-30 00:00,0.1\n2025-03-30 00:30,0.2\n2025-03-30 01:00,0.3\n")
+    own = ("model.toml", "dates.csv", "--unit", "h", "--origin", "2025-03-29T23:00", "-o", "f.nc")
+    found = zakai("forecast", *own, "--until", "2025-03-30T06:00", "--step", "5")
+    assert found.code == 0, found.err
+    assert "  1 time, 2025-03-30 06:00:00 (t = 7)\n" in found.out
+    assert package.load_result("f.nc").dates[-1] == np.datetime64("2025-03-30T06:00")
+    soon = zakai("forecast", *own, "--until", "2025-03-30T01:00:01", "--step", repr(0.5 / 3600)).out
+    assert "  2 times, 2025-03-30 01:00:00.5 (t = " in soon
+    later = zakai("forecast", *own, "--until", "7", "--step", "2.5").out
+    assert "  2 times, 2025-03-30 03:30:00 (t = 4.5) to 2025-03-30 06:00:00 (t = 7)" in later
+    early = zakai("forecast", *own, "--until", "2025-03-30T00:10", "--step", "1").err
+    assert "--until 2025-03-30T00:10: must be after the end of the record, 2025-03-30 01:00:00 (t = 2)" in early
+    assert "  3, times 2025-03-30 00:00:00 (t = 1) to 2025-03-30 01:00:00 (t = 2)" in zakai("filter", *own).out
+    numbers = ("forecast", "model.toml", "record.csv", "-o", "f.nc", "--step", "1", "--until")
+    assert "--until 2025-03-30: is a date, and the times of the record are numbers" in zakai(*numbers, "2025-03-30").err
+    assert "--until later: is neither a number nor a date" in zakai(*numbers, "later").err

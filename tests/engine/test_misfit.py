@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import re
+
+import numpy as np
 import pytest
 
 import zakai
@@ -93,3 +96,18 @@ def test_a_log_density_without_finite_mass_over_the_observation_is_named(law):
     assert not any("cannot be explained" in warning for warning in result.warnings)
     online = zakai.online(model)
     assert any("no finite mass over 'z'" in warning for warning in online.update(0.5, [0.3]).warnings) == infinite
+
+
+def test_what_an_unexplained_observation_causes_is_a_part_of_its_sentence():
+    """A fill value takes a grid of two states beyond its tolerance from there on; what was before it keeps its own warning."""
+    model = zakai.Model(
+        state=["x", "v"], drift=["v", "-x + sin(x)"], diffusion=[["0.1", 0], [0, "0.5"]], observation=["x"],
+        observation_kind="samples", observation_noise=[["0.1"]],
+        prior={"kind": "gaussian", "mean": [0, 0], "cov": [0.5, 0.5]},
+    )  # fmt: skip
+    times = 0.2 * np.arange(1, 11)
+    values = np.where(np.arange(10) == 5, -999.0, 0.1)
+    (warning,) = zakai.filter(model, zakai.Record(times, values, "samples"), "yau-yau").warnings
+    assert "cannot be explained by the model, " in warning and "a fill value must be nan, in a file NA" in warning
+    clause = r"from t = 1.2 on (the density was lost|estimates may be wrong).*tolerance_ratio exceeds 1 at \d times"
+    assert re.search(clause, warning)

@@ -1,6 +1,7 @@
 """What a result and a run report beside the posterior."""
 
 import logging
+import re
 from itertools import chain, repeat
 from threading import get_ident
 from time import sleep
@@ -9,7 +10,9 @@ import numpy as np
 import pytest
 
 import zakai
+from zakai import _progress
 from zakai.engine import batch
+from zakai.numerics import compiled
 
 PRIOR = {"kind": "gaussian", "mean": [0.0], "cov": [[1.0]]}
 
@@ -122,7 +125,6 @@ def test_a_slow_observation_within_a_segment_is_announced_with_a_method_that_is_
 
 
 def test_a_decision_that_takes_long_is_announced(monkeypatch, caplog):
-    from zakai import _progress
     from zakai.engine import driver
 
     monkeypatch.setattr(_progress, "FIRST", 0.01)
@@ -132,3 +134,23 @@ def test_a_decision_that_takes_long_is_announced(monkeypatch, caplog):
     with caplog.at_level(logging.WARNING, "zakai"):
         zakai.filter(model, zakai.Record([0.1], [0.0], "increments"))
     assert "deciding which method holds takes more than" in caplog.text
+
+
+@pytest.mark.parametrize("what", ["residuals", "predict_observations"])
+def test_laws_of_observations_that_take_long_are_announced(monkeypatch, caplog, what):
+    monkeypatch.setattr(_progress, "FIRST", 0.1)
+    model = zakai.Model(state=["x"], drift=["-x"], observation=["x"], prior=PRIOR)
+    result = zakai.filter(model, zakai.Record(0.1 * np.arange(1, 21), np.zeros(20), "increments"))
+    with caplog.at_level(logging.WARNING, "zakai"):
+        getattr(result, what)(progress=lambda *_: sleep(0.02))
+    assert re.search(r"(computing residuals|predicting observations) takes about \d+ s more", caplog.text)
+
+
+def test_compilation_is_not_announced_as_work(monkeypatch, caplog):
+    monkeypatch.setattr(_progress, "FIRST", 0.2)
+    with caplog.at_level(logging.WARNING, "zakai"), _progress.announced("work"), compiled._compilation:
+        sleep(0.5)
+    assert caplog.text == ""
+    with caplog.at_level(logging.WARNING, "zakai"), _progress.announced("work"):
+        sleep(0.5)
+    assert "work takes more than" in caplog.text

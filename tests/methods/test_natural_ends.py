@@ -90,3 +90,27 @@ def test_smoothing_near_the_limit_of_feller_has_the_exact_law(name):
         assert result.mean[k, 0] == pytest.approx(mean, abs=4e-6)
         assert result.variance[k, 0] == pytest.approx(law @ (x - mean) ** 2, abs=4e-6)
     assert not result.warnings
+
+
+def positive(log_density):
+    """Return two populations with a prior by its density, and a record of their counts."""
+    model = zakai.Model(
+        state=["n", "p"], drift=["n*(1 - 0.5*p)", "p*(0.5*n - 1)"], diffusion=[["0.15*n", 0], [0, "0.15*p"]],
+        observation=["20*n", "10*p"], observation_kind="samples", observation_family="poisson",
+        domain={"n": {"lower": 0.0}, "p": {"lower": 0.0}}, prior={"kind": "density", "log_density": log_density},
+    )  # fmt: skip
+    return model, zakai.Record([0.5, 1.0], [[22, 6], [35, 12]], "samples")
+
+
+def test_particles_take_a_density_of_several_positive_states_that_has_no_value_beyond_its_ends():
+    """Of two Gamma(4, 1/2): mean 2, variance 1."""
+    result = zakai.filter(*positive("3*log(n) - 2*n + 3*log(p) - 2*p"))
+    assert result.method == "guided-particles" and "yau-yau holds too, but refuses the prior" in result.why
+    np.testing.assert_allclose(result.mean[0], 2.0, atol=0.05)
+    np.testing.assert_allclose(result.variance[0], 1.0, atol=0.1)
+
+
+def test_a_density_that_ends_abruptly_is_refused_with_another_way_than_that_which_was_asked():
+    with pytest.raises(zakai.InputError, match="must vanish at the ends of the domain") as caught:
+        zakai.filter(*positive("-n - p"), "guided-particles")
+    assert "guided-particles" not in str(caught.value)

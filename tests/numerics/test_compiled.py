@@ -23,6 +23,25 @@ def test_the_clock_of_work_stands_still_while_a_kernel_is_compiled():
     assert gc.isenabled()  # a compilation turns the collection of garbage off
 
 
+def test_the_garbage_of_a_compilation_is_no_work():
+    """Its collection, which is put off while a kernel is compiled, takes a second after the first one."""
+    names, moments = {}, []
+    exec("def cubed(x):\n    return x * x * x", names)
+    cubed = kernel(float64(float64))(names["cubed"])
+
+    def note(phase: str, info: dict[str, int]) -> None:
+        moments.append((phase, working_time()))
+
+    gc.callbacks.append(note)
+    try:
+        assert cubed(2.0) == 8.0
+        [[] for _ in range(2000)]  # so that it is collected now, if it is not
+    finally:
+        gc.callbacks.remove(note)
+    assert [phase for phase, _ in moments[:2]] == ["start", "stop"]
+    assert moments[1][1] - moments[0][1] < 1e-4
+
+
 def test_exponentials_of_arrays_are_those_of_numpy():
     rng = np.random.default_rng(0)
     x = np.concatenate([rng.uniform(-700, 700, 1001), rng.normal(size=1000), [0.0, -np.inf, -1e8, -709.0, np.inf, np.nan]])

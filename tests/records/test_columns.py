@@ -6,6 +6,7 @@ import pytest
 import xarray
 
 import zakai
+from zakai.errors import InputError
 
 PRIOR = {"kind": "gaussian", "mean": [0.0, 0.0], "cov": [1.0, 1.0]}
 
@@ -188,3 +189,10 @@ def test_a_model_without_a_kind_is_analysed_and_simulated_and_asked_for_it(tmp_p
     assert (
         "observation_kind" not in model.text and 'observation_kind = "increments"' in model_of(observation_kind="increments").text
     )
+
+
+def test_a_frame_with_a_column_of_text_asks_for_the_columns_of_the_observations():
+    frame = pandas.DataFrame({"time": [1.0, 2.0], "status": ["ok", "chk"], "temp": [3.0, None], "volt": [1, 2], "P": [5.0, 6.0]})
+    with pytest.raises(InputError, match=r"column 'status' holds no numbers; .* as in columns=\['temp', 'volt'\]"):
+        zakai.Record.from_pandas(frame, "samples", inputs=["P"])
+    assert zakai.Record.from_pandas(frame, "samples", columns=["temp"], inputs=["P"]).values.shape == (2, 1)

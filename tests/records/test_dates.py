@@ -212,3 +212,16 @@ def test_a_checkpoint_belongs_to_its_origin(tmp_path):
     zakai.online(walk(), unit="d", origin="2024-03-30").restore(tmp_path / "state")
     with pytest.raises(InputError, match="another clock"):
         zakai.online(walk(), unit="d", origin="2024-03-29").restore(tmp_path / "state")
+
+
+def test_warnings_of_a_record_with_dates_have_dates():
+    """Of the filter, of the smoother and of online filtering alike."""
+    values = np.where(np.arange(len(DATES)) == 2, -999.0, 0.1)
+    record = zakai.Record(DATES, values, "samples", unit="d")
+    online = zakai.online(walk(), unit="d", origin=DATES[0])
+    said = [online.update(date, value).warnings for date, value in zip(DATES[1:], values[1:], strict=True)]
+    for warnings in (zakai.filter(walk(), record).warnings, zakai.smooth(walk(), record).filtered.warnings, said[1]):
+        assert any("be explained by the model" in one and f"{DATES[2]}" in one for one in warnings)
+        assert not any("t = " in one for one in warnings)
+    numbers = zakai.Record(record.times, values, "samples")
+    assert any("at t = " in one for one in zakai.filter(walk(), numbers).warnings)

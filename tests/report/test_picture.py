@@ -263,3 +263,15 @@ def test_a_joint_density_needs_two_states():
     assert joint_mass(arrays, 1) == pytest.approx(1.0, abs=0.01)
     with pytest.raises(InputError, match="give two different ones"):
         plane_bytes(fake, ("rate", "rate"))
+
+
+def test_one_outlier_does_not_set_the_range_of_two_states():
+    model = zakai.Model(
+        state=["x", "v"], drift=["v", "-x - v"], diffusion=[[0.0], [0.5]], observation=["x"], observation_kind="samples",
+        observation_noise=[["0.1"]], prior={"kind": "gaussian", "mean": [0, 0], "cov": [0.5, 0.5]},
+    )  # fmt: skip
+    values = np.where(np.arange(40) == 20, -999.0, 0.1)
+    result = zakai.filter(model, zakai.Record(0.5 * np.arange(1, 41), values, "samples"))
+    header, _ = read(plane_bytes(result, ("x", "v"), list(range(41))))
+    assert result.mean[21, 0] < -100.0
+    assert -10.0 < header["range"]["x"][0] < -1.0 < 1.0 < header["range"]["x"][1] < 10.0

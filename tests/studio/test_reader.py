@@ -105,3 +105,11 @@ def test_names_of_parameters_leave_all_sliders_of_one_length(page: Page):  # noq
     expect(page.get_by_test_id("slider-capacity_of_it")).to_be_visible()
     ends = {page.get_by_test_id(f"slider-{name}").bounding_box()["width"] for name in ("a", "capacity_of_it", "r")}
     assert max(ends) - min(ends) < 1
+
+
+def test_a_task_beside_another_one_says_that_it_has_to_wait(page: Page):  # noqa: F811
+    page.evaluate("() => { studio.link.ask = () => new Promise(() => {}); }")
+    page.get_by_test_id("fit").click()
+    expect(page.locator("#status")).to_have_text("Fitting …")
+    page.get_by_test_id("profile").click()
+    expect(page.locator("#status")).to_contain_text("Fitting … It has not ended; press Cancel to end it.")

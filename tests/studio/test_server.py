@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import re
 import signal
@@ -17,12 +18,16 @@ from starlette.websockets import WebSocketDisconnect
 
 import zakai
 from studio.page import HOST, ORIGIN, PORT, Page, studio, unpacked
+from zakai import _progress
+from zakai.numerics import compiled
 from zakai.studio.follow import Source
 from zakai.studio.session import Session
 from zakai.studio.worker import answer as computed
+from zakai.studio.worker import saying
 
 SPIRAL = zakai.gallery.text("spiral-sensor")
 SIMULATED = {"kind": "simulate", "until": 1.0, "step": 0.02, "seed": 1}
+LONG = {"text": zakai.gallery.text("lorenz"), "data": {"kind": "simulate", "until": 200.0, "step": 0.01, "seed": 0}}
 
 
 @pytest.fixture(scope="module")
@@ -136,6 +141,39 @@ def test_the_newest_of_several_requests_is_answered(page: Page):
     assert len(answered) < 20
 
 
+def test_what_a_page_asked_for_ends_when_the_page_is_gone_and_goes_on_when_it_comes_back(monkeypatch):
+    """A page that comes back in time finds its process, with the results that are kept there."""
+    monkeypatch.setattr("zakai.studio.server.RELOAD", 1.0)
+    client, token = studio()
+    address = f"/{token}/socket"
+    with client:
+        runner = client.studio.runner
+        with client.websocket_connect(address, headers={"host": HOST, "origin": ORIGIN}) as socket:
+            before = Page(client, token, socket)
+            before.ask("run", text=SPIRAL, data=SIMULATED, name="main")
+        with client.websocket_connect(address, headers={"host": HOST, "origin": ORIGIN}) as socket:
+            again = Page(client, token, socket)
+            time.sleep(2.5)
+            assert again.ask("picture", name="main")["frame"].size > 1000
+            again.send("run", **LONG, method="yau-yau", name="other")
+            while not runner.running:
+                time.sleep(0.1)
+        ends = time.monotonic() + 20.0
+        while runner.running and time.monotonic() < ends:
+            time.sleep(0.1)
+        assert runner.running is None
+
+
+def test_what_waits_is_answered_when_it_is_cancelled(page: Page):
+    page.send("run", **LONG, method="yau-yau")
+    waiting = page.send("predicted", name="main")
+    time.sleep(0.5)
+    page.send("cancel")
+    while (answer := page.receive())["id"] != waiting:
+        pass
+    assert answer["cancelled"]
+
+
 def test_a_run_is_cancelled_and_the_next_request_is_answered(page: Page):
     lorenz = zakai.gallery.text("lorenz")
     page.send("run", text=lorenz, data={"kind": "simulate", "until": 200.0, "step": 0.01, "seed": 0}, method="yau-yau")
@@ -203,6 +241,30 @@ print(answer(session, {"id": 1, "do": "large"}, 2.0, None), not session.results)
     assert "more memory than it may have (2 GiB)" in done.stdout and "--memory" in done.stdout and "True" in done.stdout
 
 
+def test_a_task_says_that_kernels_are_compiled_while_they_are_and_what_takes_long():
+    said: list[str] = []
+    with saying(said.append):
+        with compiled._compilation:
+            time.sleep(1.5)
+        time.sleep(0.5)
+        logging.getLogger("zakai").warning("fit takes about %d s more", 20)
+    compiling = "Kernels are being compiled, once for this machine; this takes up to a minute."
+    assert said == [compiling, "", "fit takes about 20 s more"]
+    said.clear()
+    with saying(said.append):
+        time.sleep(1.5)
+    logging.getLogger("zakai").warning("afterwards")
+    assert said == []
+
+
+def test_a_profile_says_how_long_it_takes(monkeypatch, caplog, tmp_path):
+    monkeypatch.setattr(_progress, "FIRST", 0.01)
+    text = SPIRAL.replace('"t/40 * x"', '"-a*x"') + "[parameters]\na = 1.0\n"
+    request = {"do": "profile", "text": text, "data": SIMULATED, "parameter": "a", "low": 0.5, "high": 2.0, "count": 5}
+    computed(Session(tmp_path), request, 4.0, lambda *_: time.sleep(0.02))
+    assert re.search(r"the profile of a takes (at most )?about \d+ to \d+ s more", caplog.text)
+
+
 def test_a_worker_that_the_system_ends_is_replaced(served, page: Page):
     client, _ = served
     page.send("run", text=zakai.gallery.text("lorenz"), data={"kind": "simulate", "until": 200.0, "step": 0.01, "seed": 0})
@@ -234,7 +296,7 @@ def test_a_file_that_grows_is_filtered_row_by_row(tmp_path):
         while answer["count"] < 30:
             answer = page.receive()
         result = zakai.filter(model, record)
-        assert answer["mean"] == pytest.approx(result.mean[-1], rel=1e-9)
+        assert answer["mean"] == pytest.approx(result.mean[-1], rel=1e-9) and answer["method"] == result.method
         assert page.ask("picture", name="stream")["frame"].size > 1000
 
 
@@ -387,3 +449,15 @@ def test_a_record_is_kept_while_the_model_changes(page: Page, tmp_path):
     assert zakai.load_result(tmp_path / "result.nc").log_likelihood == answer["log_likelihood"]
     said = page.ask("run", text=zakai.gallery.text("kalman-bucy-1d"), data=data)["error"]
     assert "press Simulate again" in said
+
+
+def test_pictures_of_a_record_with_dates_count_in_dates(page: Page):
+    """As the density does: the record, its observations with their predictions, and the residuals."""
+    rows = "".join(f"2025-03-30 {8 + k // 4:02d}:{15 * (k % 4):02d},{0.1 * (k % 5)},0.2\n" for k in range(20))
+    number = page.upload(f"time,a,b\n{rows}".encode()).json()["file"]
+    data = {"kind": "file", "file": number, "name": "dates.csv", "columns": ["a", "b"], "unit": "h", "origin": "2025-03-30T07:00"}
+    page.ask("run", text=SPIRAL, data=data, name="main")
+    origin = (np.datetime64("2025-03-30T07:00") - np.datetime64("1970-01-01")) / np.timedelta64(1, "ms")
+    described = page.ask("describe", text=SPIRAL, data=data)
+    for answer in (described, page.ask("predicted", name="main"), page.ask("residuals", name="main")):
+        assert answer["clock"] == pytest.approx({"origin": origin, "unit": 3600e3})

@@ -127,8 +127,8 @@ def smooth(
 def forecast(
     model: _Model,
     record: _Record,
-    until: Annotated[float, typer.Option(metavar="T", help="Forecast up to this time.")],
-    step: Annotated[float, typer.Option(metavar="DT", help="One forecast every DT after the end of the record.")],
+    until: Annotated[str, typer.Option(metavar="T", help="Forecast up to this time, or date of a record with dates.")],
+    step: Annotated[float, typer.Option(metavar="DT", help="One forecast every DT after the end of the record, in its unit.")],
     output: Annotated[Path, typer.Option("-o", "--output", metavar="FORECAST.nc", help="Where the result goes (NetCDF).")],
     method: _Method = "auto",
     option: _Options = None,

@@ -15,6 +15,7 @@ from zakai.cli._progress import progress
 from zakai.errors import InputError
 from zakai.models.files import load_model
 from zakai.records import Record, read_inputs, read_record, read_truth
+from zakai.records.dates import Clock, date_of
 from zakai.records.writing import shown
 
 if TYPE_CHECKING:
@@ -67,8 +68,9 @@ def filter(
     result.save(output)
     if report is not None:
         write_report(result, report, truth=truth)
+    first, last = (_moment(record.times[k], record.clock) for k in (0, -1))
     lines = [
-        ("observations", f"{len(record):,}, times {record.times[0]:.12g} to {record.times[-1]:.12g}"),
+        ("observations", f"{len(record):,}, times {first} to {last}"),
         ("log-likelihood", f"{result.log_likelihood:.6f}"),
     ]
     _summarise(result, lines, (0, "start") if smoothed else (-1, "end"), [output, report])
@@ -77,7 +79,7 @@ def filter(
 def forecast(
     source: str,
     record_path: Path,
-    until: float,
+    until: str,
     step: float,
     output: Path,
     method: str,
@@ -93,16 +95,42 @@ def forecast(
 
     check_outputs([output], [source, record_path, inputs_path])
     model, record, options = _given(source, record_path, settings, inputs_path, unit, origin, columns)
-    last = float(record.times[-1])
-    if not until > last:
-        raise InputError(f"--until {until:.12g}: must be after the end of the record, {last:.12g}")
-    times = clock(last, until, step)
+    last, end = float(record.times[-1]), _end(until, record)
+    if not end > last:
+        raise InputError(f"--until {until}: must be after the end of the record, {_moment(last, record.clock)}")
+    times = clock(last, end, step)
     with progress("filtering") as advance:
         result = run(model, record, method, keep="moments", progress=advance, **options)
     found = result.forecast(times)
     _warn(_but_note(dict.fromkeys([*result.warnings, *found.warnings]), record))
     found.save(output)
-    _summarise(found, [("forecast times", f"{len(times):,}, {times[0]:.12g} to {times[-1]:.12g}")], (-1, "end"), [output])
+    _summarise(found, [("forecast", _span(times, record.clock))], (-1, "end"), [output])
+
+
+def _end(until: str, record: Record) -> float:
+    """Return the time of `--until`: a number, or a date where the record has dates."""
+    try:
+        return float(until)
+    except ValueError:
+        pass
+    date = date_of(until)
+    if date is None:
+        raise InputError(f"--until {until}: is neither a number nor a date, as in 2024-01-31T12:00")
+    if record.clock is None:
+        raise InputError(f"--until {until}: is a date, and the times of the record are numbers; give a number")
+    return record.clock.time(date)
+
+
+def _moment(time: float, clock: Clock | None) -> str:
+    """Return a time as text: its number, with its date where the record has dates."""
+    return f"{time:.12g}" if clock is None else f"{clock.text(time)} (t = {time:.12g})"
+
+
+def _span(times: Any, clock: Clock | None) -> str:
+    """Return the number of times, the first and the last."""
+    if len(times) == 1:
+        return f"1 time, {_moment(times[0], clock)}"
+    return f"{len(times):,} times, {_moment(times[0], clock)} to {_moment(times[-1], clock)}"
 
 
 def fit(

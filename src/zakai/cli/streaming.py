@@ -15,6 +15,7 @@ from zakai.cli._files import check_outputs
 from zakai.cli.filtering import options_of
 from zakai.errors import InputError
 from zakai.models.files import load_model
+from zakai.records.dates import dated
 from zakai.records.stream import Line, lines_of
 from zakai.records.writing import shown
 
@@ -113,7 +114,8 @@ class _Stream:
             kind = _NUMBERS.sub("0", warning)
             if kind not in self.warned:
                 self.warned.add(kind)
-                print(f"warning: from t = {estimate.time:.12g} on: {warning}", file=sys.stderr, flush=True)
+                (when,) = dated([f"t = {estimate.time:.12g}"], self.online.clock)
+                print(f"warning: from {when} on: {warning}", file=sys.stderr, flush=True)
         if self.accepted % self.every == 0:
             sys.stdout.write(json.dumps({name: FIELDS[name](estimate) for name in self.fields}, allow_nan=False) + "\n")
             sys.stdout.flush()

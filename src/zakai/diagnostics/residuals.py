@@ -39,7 +39,7 @@ def residuals(result: FilterResult, seed: int = 0, first: int = 0, progress: Pro
     found: Array = np.full(draws.shape, np.nan)
     error, share = 0.0, 0.0
     observed = [parts for parts in zip(plan.runs(record, "moments"), plan.blocks, strict=True) if parts[1].observations]
-    with counting("residuals", len(observed) * (len(record) - first), progress) as counted:
+    with counting("computing residuals", len(observed) * (len(record) - first), progress) as counted:
         for run, block in observed:
             columns = list(block.observations)
             for k, (below, upto), *errors in counted(_laws(run, first)):

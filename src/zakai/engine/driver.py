@@ -24,6 +24,7 @@ from zakai.models.model import Model
 from zakai.models.possible import check_possible
 from zakai.models.prior import Prior
 from zakai.records import Inputs, Record
+from zakai.records.dates import dated
 
 
 @overload
@@ -148,7 +149,8 @@ def filter_planned(
     for plan, one, of_one in zip(plans, records, runs, strict=True):
         results.append(plan.result(of_one, warned))
         results[-1].record = one
-        results[-1].warnings[:0] = [one._note] if one._note else []
+        notes = [one._note] if one._note else []
+        results[-1].warnings = dated([*notes, *results[-1].warnings], one.clock)
     return results
 
 

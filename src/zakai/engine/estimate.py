@@ -16,6 +16,7 @@ from zakai.engine.feed import Feed, Moment
 from zakai.errors import InputError
 from zakai.models.prior import GaussianPrior
 from zakai.notes.health import warnings_of_step
+from zakai.records.dates import dated
 
 if TYPE_CHECKING:
     from zakai.engine.online import Online
@@ -100,7 +101,7 @@ class Estimate:
             if moment.info is not None:
                 method = feed.setting.method
                 said.update(dict.fromkeys(warnings_of_step(moment.info.health, method.bounds, method.losses)))
-        return tuple(said)
+        return tuple(dated(said, self._online.clock))
 
     @property
     def density(self) -> Density:

@@ -119,7 +119,7 @@ class Feed:
         path = getattr(moment.state, "path", None)
         model, schedule = along_path(self.setting.model, schedule, np.array([values]), None if path is None else path - values)
         lengths = notes_on_lengths(schedule, distances_of_lengths(model, theta, schedule, infos))
-        return (*moment.notes, *lengths, *notes_on_law(model, theta, schedule, np.array([values]), infos))
+        return (*moment.notes, *lengths, *notes_on_law(model, theta, schedule, np.array([values]), infos)[0])
 
     def density(self, moment: Moment) -> Density:
         """Return the density at a moment."""

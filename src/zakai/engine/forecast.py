@@ -12,6 +12,7 @@ from zakai.errors import InputError
 from zakai.methods._protocol import State
 from zakai.methods._states import Joined
 from zakai.records import Inputs, Record
+from zakai.records.dates import dated
 from zakai.records.inputs import check_inputs, expected_inputs
 
 if TYPE_CHECKING:
@@ -64,7 +65,7 @@ def forecast(result: FilterResult, times: Any, inputs: Inputs | None = None) -> 
     runs = [ForecastRun(run, state, last) for run, state in zip(plan.runs(future, None), states, strict=True)]
     filter_all(runs, None, len(runs))
     found = plan.result(runs)
-    found.record = future
+    found.record, found.warnings = future, dated(found.warnings, future.clock)
     found.times[0], found.mean[0] = last, result.mean[-1]
     found.attributes["kind"] = "forecast"
     return found

@@ -148,11 +148,22 @@ def _plan_of_whole(
         fault = unfit(setting) if unfit and others else ""
         if not fault and set(others) - {_LAST}:
             fault = _fault_at_prior(setting)
+        elif not fault and others and setting.prior_has_ends:
+            fault = _refused_at_prior(setting)
         if not fault:
             whole = IndependentBlock(tuple(range(model.n)), tuple(range(model.m)), model.state, model, prior)
             return Plan(model, (whole,), (setting,), "; ".join([why, *lost]), considered)
         lost.append(f"{name} holds too, but {fault}")
         name, considered = others[0], {**considered, others[0]: conditions_of(others[0], model)}
+
+
+def _refused_at_prior(setting: Setting) -> str:
+    """Return why a method refuses the prior, or nothing."""
+    try:
+        setting.begin()
+    except InputError as wrong:
+        return f"refuses the prior: {wrong}"
+    return ""
 
 
 def _fault_at_prior(setting: Setting) -> str:

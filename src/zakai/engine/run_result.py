@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from copy import copy
 
 import numpy as np
 
@@ -14,7 +15,7 @@ from zakai.engine.versions import versions
 from zakai.methods._protocol import joined
 from zakai.notes.escape import notes_on_escape
 from zakai.notes.lengths import distances_of_lengths, notes_on_lengths
-from zakai.notes.misfit import notes_on_law
+from zakai.notes.misfit import OF_START, notes_on_law
 from zakai.notes.model import notes_on_domain, notes_on_formulas
 
 
@@ -64,9 +65,17 @@ def result_of_run(run: Run, why: str, considered: Mapping[str, tuple[Condition, 
     undefined += notes_on_domain(noted, theta, record, result, method.reflects)
     undefined += notes_on_escape(method.name, noted, schedule, theta, result.mean, result.cov)
     lengths = notes_on_lengths(schedule, distances)
-    misfit = notes_on_law(noted, theta, schedule, run.values, infos)
-    result.warnings.extend([*undefined, *run.notes, *lengths, *misfit, *run.health_warnings(result)])
+    misfit, first = notes_on_law(noted, theta, schedule, run.values, infos, (result.bounds, method.losses))
+    result.warnings.extend([*undefined, *run.notes, *lengths, *misfit, *run.health_warnings(_until(result, first))])
     return run.complete(result)
+
+
+def _until(result: FilterResult, first: int) -> FilterResult:
+    """Return the result without the figures from observation `first` on, which its note has."""
+    found = copy(result)
+    known = np.arange(len(result.times)) <= first
+    found.health = {name: np.where(known | (name in OF_START), figures, np.nan) for name, figures in result.health.items()}
+    return found
 
 
 def _with_start(errors: np.ndarray | None) -> np.ndarray | None:

@@ -21,6 +21,9 @@ _ENDS = (
     "in two or more states the density must vanish before the ends of the domain, and have a value beyond them; take the "
     "logarithm of a positive state as the state, or guided-particles"
 )
+_ENDS_OF_PARTICLES = (
+    "in two or more states the density must vanish at the ends of the domain; take the logarithm of a positive state as the state"
+)
 KEPT = 8  # schedules whose preparation is kept for each model
 
 
@@ -70,17 +73,26 @@ class Setting(NamedTuple):
         )
         return result
 
+    @property
+    def prior_has_ends(self) -> bool:
+        """Whether the prior is a density of several states of which some have a domain."""
+        return self.model.n > 1 and bool(self.model.domain) and isinstance(self.prior, DensityPrior)
+
+    @property
+    def _ends(self) -> str:
+        return _ENDS_OF_PARTICLES if self.method.name == "guided-particles" else _ENDS
+
     @one_thread
     def begin(self) -> tuple[Prepared, State]:
         """Return what is prepared for no interval, and the state at the model's start."""
         prepared = self.prepared(Schedule.empty(self.model.m))
-        inside = self.model.n > 1 and bool(self.model.domain) and isinstance(self.prior, DensityPrior)
+        inside = self.prior_has_ends
         try:
             state = self.method.init(prepared, self.prior)
         except InputError as error:
             words = str(error)
             words = f"{self.model.source}: {words}" if words.startswith("prior") else words
-            error.args = (f"{words}; {_ENDS}" if inside else words,)
+            error.args = (f"{words}; {self._ends}" if inside else words,)
             raise
         if inside:
             self._check_domain(self.method.density(prepared, state))
@@ -91,4 +103,5 @@ class Setting(NamedTuple):
         for name, interval in self.model.domain.items():
             low, high = density.marginal(name).quantile([NEGLIGIBLE, 1 - NEGLIGIBLE]).ravel()
             if low < interval.lower or high > interval.upper:
-                raise InputError(f"{self.model.source}: prior: has mass outside of the domain of {name!r}, {interval}; {_ENDS}")
+                where = f"has mass outside of the domain of {name!r}, {interval}"
+                raise InputError(f"{self.model.source}: prior: {where}; {self._ends}")

@@ -33,6 +33,7 @@ from zakai.methods._states import Joined
 from zakai.models.model import Model
 from zakai.numerics.one_thread import one_thread
 from zakai.records import Inputs, Record
+from zakai.records.dates import dated
 
 _EVIDENCE = "the evidence of the backward pass differs from the filter's, in nats"
 
@@ -132,7 +133,7 @@ def smooth(
     result = plan.result(runs)
     result.record, result.increment_law_error = record, filtered.increment_law_error
     for one in (filtered, result):
-        one.warnings[:0] = [record._note] if record._note else []
+        one.warnings = dated([*([record._note] if record._note else []), *one.warnings], record.clock)
     result.attributes["kind"] = "smoothed"
     shared = {field.name: getattr(result, field.name) for field in fields(result)}
     return SmoothingResult(**shared, filtered=filtered, _runs=tuple(runs))

@@ -7,7 +7,7 @@ family, the difference is the negative logarithm of a probability, up to a few n
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,9 +17,12 @@ from zakai.methods._protocol import Infos
 from zakai.models.kept import kept
 from zakai.models.model import Model
 from zakai.models.numeric import numpy_function
+from zakai.notes.health import Bounds
 from zakai.records.schedule import Schedule
 
 Array = NDArray[np.float64]
+Losses = Mapping[str, float]
+OF_START = ("start_error",)  # figures of the prior, which no observation explains
 LARGEST = 200.0  # nats of a coordinate: 20 standard deviations
 AT_ONCE = 32  # rows in which the mode of a log density is searched together
 ROUNDS, CLOSE = 60, 0.5  # of that search: the most rounds, and the gain in nats that ends it
@@ -54,16 +57,35 @@ def misfits(model: Model, theta: Array, schedule: Schedule, values: Array, infos
         return np.where(np.isfinite(short) & (short > LARGEST * np.maximum(seen.sum(axis=1), 1)), short, 0.0)
 
 
-def notes_on_law(model: Model, theta: Array, schedule: Schedule, values: Array, infos: Infos) -> list[str]:
-    """Return sentences on a log density without finite mass over what is observed, else on the observations that fall short."""
+def notes_on_law(
+    model: Model, theta: Array, schedule: Schedule, values: Array, infos: Infos, judged: tuple[Bounds, Losses] = ({}, {})
+) -> tuple[list[str], int]:
+    """Return sentences on a log density without finite mass over what is observed, else on the observations that fall short.
+
+    Args:
+        model: The model.
+        theta: The parameters (p,).
+        schedule: The K intervals.
+        values: Samples or increments (K, m), zero where there is none.
+        infos: What the filter reports after each observation.
+        judged: The bounds of its figures, and the values above which the density is lost; what exceeds them from the first
+            observation on that falls short is a part of the sentence.
+
+    Returns:
+        The sentences, and the number of the first observation that falls short, K where none does.
+    """
     infinite = _infinite_mass(model, theta, schedule, values, infos)
     if infinite:
         return [
             f"observation_log_density has no finite mass over {infinite!r}: it is no density of {infinite!r}, and the "
             f"log-likelihood has no meaning; subtract the logarithm of its integral over {infinite!r} (of a count: of its "
             "sum over all counts; then this note does not apply)"
-        ]
-    return _note_on_misfits(misfits(model, theta, schedule, values, infos), schedule.stops)
+        ], len(schedule)
+    short = misfits(model, theta, schedule, values, infos)
+    if not short.any():
+        return [], len(schedule)
+    first = int(np.argmax(short > 0.0))
+    return [_note_on_misfits(short, schedule.stops) + _consequences(infos, judged, schedule.stops, first)], first
 
 
 def _infinite_mass(model: Model, theta: Array, schedule: Schedule, values: Array, infos: Infos) -> str:
@@ -87,15 +109,32 @@ def _infinite_mass(model: Model, theta: Array, schedule: Schedule, values: Array
     return ""
 
 
-def _note_on_misfits(short: Array, times: Array) -> list[str]:
-    """Return a sentence on the observations at these times (K,) that fall short, if any do."""
-    if not short.any():
-        return []
-    worst, count = int(np.argmax(short)), int(np.count_nonzero(short))
-    which = f"{_display.counted(count, 'observation')} of {len(short)} cannot be explained by the model, most at "
-    which = which if len(short) > 1 else "the observation cannot be explained by the model, at "
+def _note_on_misfits(short: Array, times: Array) -> str:
+    """Return a sentence on the observations at these times (K,) that fall short."""
+    worst, first, count = int(np.argmax(short)), int(np.argmax(short > 0.0)), int(np.count_nonzero(short))
+    which = f"{_display.counted(count, 'observation')} of {len(short)} cannot be explained by the model, "
+    which += "" if first == worst else f"first at t = {times[first]:.12g}, "
+    which = f"{which}most at " if len(short) > 1 else "the observation cannot be explained by the model, at "
     deviations = f"t = {times[worst]:.12g} ({np.sqrt(2 * short[worst]):.2g} standard deviations)"
-    return [f"{which}{deviations}; check that observation and its noise"]
+    return f"{which}{deviations}; check that observation and its noise (a fill value must be nan, in a file NA or an empty cell)"
+
+
+def _consequences(infos: Infos, judged: tuple[Bounds, Losses], times: Array, first: int) -> str:
+    """Return the end of the sentence: the figures that exceed their bounds from the first observation that falls short on."""
+    bounds, losses = judged
+    later = {name: np.asarray(figures, float)[first:] for name, figures in infos.health.items()}
+    lost = any((later[name] > limit).any() for name, limit in losses.items() if name in later)
+    over = []
+    for name in OF_START:
+        later.pop(name, None)
+    for name, bound in {**losses, **{name: bound for name, (bound, _) in bounds.items()}}.items():
+        count = int((later[name] > bound).sum()) if name in later else 0
+        if count:
+            over.append(f"{name} exceeds {bound:g} at {_display.counted(count, 'time')}, up to {np.nanmax(later[name]):.2g}")
+    if not over:
+        return ""
+    what = "the density was lost, and later rows mean nothing" if lost else "estimates may be wrong"
+    return f"; from t = {times[first]:.12g} on {what} ({', '.join(over)})"
 
 
 def _largest_of_increments(model: Model, theta: Array, schedule: Schedule, values: Array) -> Array:

@@ -63,9 +63,10 @@ class _Compilation:
         self.depth -= 1
         if self.depth == 0:
             self.timer.cancel()
-            self.clock = (self.seconds(), None)
             if self.collects:
                 gc.enable()
+                gc.collect(0)  # what was put off, which the next allocation would do: seconds after the first compilation
+            self.clock = (self.seconds(), None)
 
     def seconds(self) -> float:
         """Return the seconds until now."""
@@ -99,6 +100,11 @@ def compilation_time() -> float:
 def compiling() -> bool:
     """Return whether this thread compiles a kernel. Numba must not be interrupted there: it would keep what is half done."""
     return bool(global_compiler_lock.is_locked())
+
+
+def compiles_since() -> float | None:
+    """Return when the compilation began, by `time.monotonic`, with which any thread is busy now; None where none is."""
+    return _compilation.clock[1]
 
 
 def working_time() -> float:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import datetime
+import re
+from collections.abc import Iterable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -23,6 +25,9 @@ _NANOSECONDS = {
     "year": 31557600 * _SECOND,  # 365.25 days
 }
 _OTHER_NAMES = {"D": "d", "H": "h", "W": "week", "Y": "year", "day": "d", "hour": "h", "minute": "min", "second": "s"}
+
+
+_TIME = re.compile(r"\bt = ([-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?)(?![\d*/])")
 
 
 class Clock(NamedTuple):
@@ -60,10 +65,25 @@ class Clock(NamedTuple):
         apart = whole.astype(np.int64) * size + np.round((times - whole) * (size / step)).astype(np.int64) * step
         return np.asarray(self.origin + apart.astype("timedelta64[ns]"))
 
+    def text(self, time: float) -> str:
+        """Return the date of one time as text, to the second or, where it is not whole, to the digits that it needs."""
+        step = "ms" if _NANOSECONDS[self.unit] >= _SECOND else "ns"
+        half = np.timedelta64(_NANOSECONDS[step] // 2, "ns")  # so that it is rounded
+        date = (self.dates(np.array([time], float))[0] + half).astype(f"datetime64[{step}]")
+        seconds, _, fraction = str(date).replace("T", " ").partition(".")
+        return f"{seconds}.{fraction.rstrip('0')}".rstrip(".")
+
     def days(self, times: Any) -> Any:
         """Return the times as numbers of days since 1970, which Matplotlib draws as dates."""
         start = self.origin.astype("datetime64[ns]").astype(np.int64) / _NANOSECONDS["d"]
         return start + np.asarray(times, float) * (_NANOSECONDS[self.unit] / _NANOSECONDS["d"])
+
+
+def dated(sentences: Iterable[str], clock: Clock | None) -> list[str]:
+    """Return sentences with dates in place of times, where there is a clock: `t = 1.5` becomes `2024-03-31 12:00:00`."""
+    if clock is None:
+        return list(sentences)
+    return [_TIME.sub(lambda found: clock.text(float(found[1])), one) for one in sentences]
 
 
 def unit_name(unit: Any, what: str = "record") -> str:

@@ -237,6 +237,8 @@ class Record:
         rest = rest.drop(columns=inputs)
         if columns is not None:
             rest = rest[_known_columns(columns, list(rest.columns))]
+        else:
+            _check_numbers(rest)
         read = [_column(rest.iloc[:, i], f"column {rest.columns[i]!r}") for i in range(rest.shape[1])]
         values = np.column_stack(read) if read else np.empty((len(frame), 0))
         dated = times.dtype.kind in "mM"
@@ -370,6 +372,22 @@ def _known_columns(columns: Any, known: list[Any]) -> list[Any]:
             what = "is not one of" if name not in known else "is there twice among"
             raise InputError(f"Record.from_pandas: columns: {name!r} {what} the columns {listing(map(str, known))}")
     return wanted
+
+
+def _check_numbers(frame: Any) -> None:
+    """Refuse a frame that has columns of something else than numbers among those that may be observations."""
+    numbers = [name for name, kind in frame.dtypes.items() if getattr(kind, "kind", "O") in "biuf"]
+    for i, name in enumerate(frame.columns):
+        try:
+            _column(frame.iloc[:, i], "")
+        except InputError:
+            if not numbers:  # nothing to choose from
+                return
+            wanted = ", ".join(map(repr, numbers))
+            raise InputError(
+                f"Record.from_pandas: column {name!r} holds no numbers; name the columns of the observations, as in "
+                f"columns=[{wanted}]"
+            ) from None
 
 
 def _names_of(part: Any) -> list[str]:

@@ -21,7 +21,8 @@ _ROWS = 200  # of the end of a record, of which the residuals are computed
 _BINS, _LAGS, _MOST_COORDINATES = 10, 20, 4
 _TESTED_LAGS = 10  # of the test of autocorrelation, or a fifth of the residuals
 _CLIP = 1e-9  # a residual nearer to 0 or 1 is drawn as this
-_SMALL = 0.01  # p-values below this are said to disagree
+_SMALL, _WEAK = 0.01, 0.05  # p-values below which a test speaks against the model, and does so weakly
+_FAR, _MOST_FAR = 4.0, 0.1  # deviations of an outlier, of which a true model has one in 16,000, and the largest share of them
 
 
 class Calibration(NamedTuple):
@@ -39,22 +40,37 @@ class Calibration(NamedTuple):
     variance: float
     independence: float
 
-    def table(self) -> str:
-        """Return the tests as a table, with what a small p-value says."""
+    def verdicts(self) -> list[tuple[str, str, str, bool]]:
+        """Return for each test its name, its p-value, what that says, and whether it speaks against the model."""
         power = float(np.mean(self.scores**2))
-        rows = [
-            ("Uniform (Kolmogorov-Smirnov)", self.uniformity, "the model has a bias or a noise of the wrong size or law"),
+        tests = [
+            ("Uniform (Kolmogorov-Smirnov)", "uniformity", "the model has a bias or a noise of the wrong size or law"),
             (
-                f"Mean square of the normal scores is 1 (chi-squared): {power:.3g}",
-                self.variance,
+                f"Mean square of the normal scores: {power:.3g}, expected 1 (chi-squared)",
+                "variance",
                 "the model's noise is too small, or it has a bias" if power > 1 else "the model's noise is too large",
             ),
-            ("No autocorrelation (Ljung-Box)", self.independence, "the model's dynamics are wrong"),
+            ("No autocorrelation (Ljung-Box)", "independence", "the model's dynamics are wrong"),
         ]
+        return [(name, _p_value(getattr(self, key)), *self._reading(key, said)) for name, key, said in tests]
+
+    def _reading(self, key: str, said: str) -> tuple[str, bool]:
+        p, far = getattr(self, key), np.abs(self.scores) > _FAR
+        if p >= _WEAK:
+            return "consistent with the model", False
+        count = int(far.sum())
+        if 0 < count <= _MOST_FAR * len(far) and len(far) - count >= 3:
+            rest = calibration_of(self.times[~far], self.u[~far])
+            if getattr(rest, key) >= _WEAK:
+                what = "one outlier" if count == 1 else f"{count} outliers"
+                return f"{what} beyond {_FAR:g} deviations; the others are consistent with the model", True
+        return (said, True) if p < _SMALL else (f"weak evidence that {said}", True)
+
+    def table(self) -> str:
+        """Return the tests as a table, with what a small p-value says."""
         cells = "".join(
-            f'<tr><td>{name}</td><td class="number">{_p_value(p)}</td><td class="{"fails" if p < _SMALL else "open"}">'
-            f"{said if p < _SMALL else 'consistent with the model'}</td></tr>"
-            for name, p, said in rows
+            f'<tr><td>{name}</td><td class="number">{p}</td><td class="{"fails" if fails else "open"}">{said}</td></tr>'
+            for name, p, said, fails in self.verdicts()
         )
         return f"<table><thead><tr><th>Test</th><th>p-value</th><th>Reading</th></tr></thead><tbody>{cells}</tbody></table>"
 
@@ -122,7 +138,7 @@ def section(result: Any) -> str:
         "came. If the model is true, residuals are uniform on 0 to 1 and independent: the histogram is flat, the normal scores "
         "look like standard normal numbers, and their autocorrelations are zero. The bands hold 95% of the values of a true "
         "model. A U-shaped histogram shows that the noise of the model is too small, a hump that it is too large, a slope a "
-        "bias; autocorrelation shows that the dynamics are wrong.</p>"
+        "bias; autocorrelation shows that the dynamics are wrong, unless outliers make it.</p>"
     ]
     used = f" of the last {_ROWS:,} of {count:,} observations" if count > _ROWS else ""
     parts += [f"<p><strong>{escape(str(one.message))}.</strong></p>" for one in caught]

@@ -21,6 +21,7 @@ from zakai.report.picture import number_of
 
 SIZE = 121  # points along an axis of the window; odd, so that the mean is one
 PROBABILITIES = (0.5, 0.95)
+_FAR = 5.0  # distances of the quartiles of the times, or usual widths, beyond which a window is left out of the range
 _REACH = 5.0  # standard deviations along each axis of the window
 _SCALE = 65535
 _MOST_KERNELS = 1000  # of a mixture that is evaluated at every point
@@ -143,11 +144,15 @@ def _levels(values: np.ndarray) -> np.ndarray:
 
 
 def _range(arrays: dict[str, np.ndarray], axis: int, periodic: bool, size: int) -> list[float]:
-    """Return the range to show of one axis: four fifths of the windows, and the truth."""
+    """Return the range to show of one axis: four fifths of the windows, without those that lie far off, and the truth."""
     if periodic:
         return [-np.pi, np.pi]
     middle = arrays["origin"][:, axis] + arrays["basis"][:, axis].sum(axis=1) * 0.5 * (size - 1)
     half = 0.8 * np.sqrt((arrays["basis"][:, axis] ** 2).sum(axis=1)) * 0.5 * (size - 1)
+    low, centre, high = np.nanquantile(middle, [0.25, 0.5, 0.75])
+    usual = float(np.nanmedian(half))
+    near = (np.abs(middle - centre) <= _FAR * max(high - low, usual)) & (half <= _FAR * max(high - low, usual))
+    middle, half = (middle[near], half[near]) if near.any() else (middle, half)
     ends = np.concatenate([middle - half, middle + half, arrays.get("truth", np.zeros((0, 2)))[:, axis]])
     ends = ends[np.isfinite(ends)]
     return [float(ends.min()), float(ends.max())]

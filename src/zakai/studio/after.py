@@ -9,6 +9,7 @@ import numpy as np
 
 from zakai.errors import InputError, ZakaiError
 from zakai.models.clock import clock
+from zakai.report.charts import clock_header
 from zakai.studio.running import method_of, rows_of, summary
 from zakai.studio.session import Answer, Held, Report, Session
 
@@ -76,7 +77,8 @@ def predicted(session: Session, request: Mapping[str, Any], report: Report) -> A
     seen = np.isfinite(record.values)
     outside = float(np.mean(((record.values < low) | (record.values > high))[seen])) if seen.any() else None
     names = list(result.model.observation_names) if result.model is not None else []
-    return {"names": names, "outside": outside, "before": first, "rates": record.kind == "increments"}, arrays
+    about = {"names": names, "outside": outside, "before": first, "rates": record.kind == "increments"}
+    return {**about, "clock": clock_header(record.clock)}, arrays
 
 
 def residuals(session: Session, request: Mapping[str, Any], report: Report) -> Answer:
@@ -103,10 +105,7 @@ def residuals(session: Session, request: Mapping[str, Any], report: Report) -> A
                 "count": count,
                 "heights": (np.histogram(one.u, BINS, (0.0, 1.0))[0] * BINS / count).tolist(),
                 "band": [float(low), float(high)],
-                "uniformity": one.uniformity,
-                "variance": one.variance,
-                "independence": one.independence,
-                "power": float(np.mean(one.scores**2)),
+                "verdicts": one.verdicts(),
                 "autocorrelation": one.autocorrelation.tolist(),
             }
         )
@@ -114,7 +113,7 @@ def residuals(session: Session, request: Mapping[str, Any], report: Report) -> A
         arrays[f"scores{len(found) - 1}"] = one.scores.astype(np.float32)
     if not found:
         raise InputError("residuals: fewer than five observations have one; take a longer record")
-    return {"observations": found, "before": first}, arrays
+    return {"observations": found, "before": first, "clock": clock_header(result.clock)}, arrays
 
 
 def compare(session: Session, request: Mapping[str, Any], report: Report) -> Answer:
@@ -160,6 +159,7 @@ def fit(session: Session, request: Mapping[str, Any], report: Report) -> Answer:
 
 def profile(session: Session, request: Mapping[str, Any], report: Report) -> Answer:
     """Return the log-likelihood as a function of one parameter, the others as they are, around its maximum in an interval."""
+    from zakai._progress import announced
     from zakai.engine.driver import filter as run_filter
 
     model = session.model(request)
@@ -181,14 +181,17 @@ def profile(session: Session, request: Mapping[str, Any], report: Report) -> Ans
             return float(run_filter(there, found.record, method, keep="moments", **options).log_likelihood)
         except ZakaiError:  # such as a noise that is not positive there
             return float("nan")
+        finally:
+            announce(done, -(-done // count) * count, NARROWED * count)
 
-    for _ in range(NARROWED):
-        values = np.linspace(low, high, count)
-        heights = np.array([height(float(value)) for value in values])
-        high_enough = np.flatnonzero(heights >= np.nanmax(heights, initial=-np.inf) - SEEN)
-        if len(high_enough) == 0 or len(high_enough) >= count // 2:
-            break
-        low, high = values[max(0, high_enough[0] - 1)], values[min(count - 1, high_enough[-1] + 1)]
+    with announced(f"the profile of {name}") as announce:
+        for _ in range(NARROWED):
+            values = np.linspace(low, high, count)
+            heights = np.array([height(float(value)) for value in values])
+            high_enough = np.flatnonzero(heights >= np.nanmax(heights, initial=-np.inf) - SEEN)
+            if len(high_enough) == 0 or len(high_enough) >= count // 2:
+                break
+            low, high = values[max(0, high_enough[0] - 1)], values[min(count - 1, high_enough[-1] + 1)]
     if not np.isfinite(heights).any():
         raise InputError(f"profile: there is no log-likelihood for {name} from {low:g} to {high:g}; take other ends")
     return {"parameter": name}, {"values": values, "log_likelihood": heights}

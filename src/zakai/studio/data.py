@@ -19,6 +19,7 @@ from zakai.records.dates import date_of, usual_unit
 from zakai.records.dialect import dialect_of
 from zakai.records.header import cells_of, header_of
 from zakai.records.numbers import NUMBER
+from zakai.report.charts import clock_header
 from zakai.simulation.simulate import simulate
 from zakai.studio.time_column import with_time
 
@@ -189,6 +190,7 @@ def described(model: Model, found: Given) -> tuple[dict[str, Any], dict[str, np.
         "irregular": bool(len(steps) and np.ptp(steps) > 1e-6 * abs(median or 1.0)),
         "unit": record.unit,
         "origin": None if record.clock is None else str(record.clock.origin)[:19],
+        "clock": clock_header(record.clock),
         "truth": found.truth is not None,
     }
     return about, {"times": record.times[rows], "values": record.values[rows].astype(np.float32)}

@@ -63,12 +63,14 @@ class Worker:
         await self._next()
 
     async def cancel(self) -> None:
-        """End what runs and forget what waits."""
+        """End what runs and what waits, and answer that it is cancelled."""
+        ended, running = list(self.waiting.values()), self.running
         self.waiting.clear()
-        running = self.running
         if running is not None:
             await self._end()
-            await self.send(packed({"id": running.get("id"), "do": running.get("do"), "error": "cancelled", "cancelled": True}))
+            ended.insert(0, running)
+        for one in ended:
+            await self.send(packed({"id": one.get("id"), "do": one.get("do"), "error": "cancelled", "cancelled": True}))
 
     async def abandon(self) -> None:
         """Forget what waits, and what runs unless it is nearly done, since a new process takes seconds; its answer is dropped."""

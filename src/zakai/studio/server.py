@@ -32,6 +32,7 @@ LARGEST_FILE = 64 << 20  # bytes of a record that is dropped
 MOST_ROWS = 1_000_000
 MOST_FILES = 20  # that are kept; of more the oldest goes
 LARGEST_MESSAGE = 4 << 20
+RELOAD = 10.0  # seconds in which a page that is gone may come back, before what it asked for ends
 HOST = "127.0.0.1"
 QUICK = {"check", "write", "gallery", "columns", "describe", "shell"}  # answered while one types
 LONGER = {"methods", "algebra"}  # answered beside a run, until the model is another one
@@ -66,6 +67,8 @@ class Studio:
         self.thinker = Worker(self.folder, settings.memory, self.send, impatient=True)
         self.runner = Worker(self.folder, settings.memory, self.send)
         self.following: asyncio.Task[None] | None = None
+        self.leaving: asyncio.Task[None] | None = None
+        self.back = asyncio.Event()  # whether a page is there again
         self.first: dict[str, Any] | None = None
         if settings.tables is not None:
             (self.folder / "tables-are-in").write_text(str(settings.tables), encoding="utf-8")
@@ -86,6 +89,7 @@ class Studio:
         async def lifespan(_: Starlette) -> AsyncIterator[None]:
             await asyncio.gather(self.quick.start(), self.runner.start())
             yield
+            await self._stay()
             await self.stop_following()
             await asyncio.gather(*(one.close() for one in self.workers))
             shutil.rmtree(self.folder, ignore_errors=True)
@@ -145,13 +149,14 @@ class Studio:
     async def socket(self, socket: WebSocket) -> None:
         """Pass requests of the page to the workers, and their answers back; a newer page takes the place of an older one."""
         await socket.accept()
+        await self._stay()
         older, self.page = self.page, socket
         if older is not None:
             with contextlib.suppress(RuntimeError, WebSocketDisconnect):
                 await older.send_text(json.dumps({"do": "replaced"}))
                 await older.close(4001)
         await self.stop_following()
-        await asyncio.gather(*(one.abandon() for one in self.workers))
+        await self._abandon()
         await socket.send_text(json.dumps(self._hello()))
         try:
             while True:
@@ -165,7 +170,26 @@ class Studio:
             pass
         if self.page is socket:
             self.page = None
+            self.back.clear()
+            self.leaving = asyncio.create_task(self._leave())
             await self.stop_following()
+
+    async def _leave(self) -> None:
+        """End what a page has asked for that is gone and does not come back."""
+        try:
+            await asyncio.wait_for(self.back.wait(), RELOAD)
+        except TimeoutError:
+            await self._abandon()
+
+    async def _stay(self) -> None:
+        """Forget that the page was gone; wait until what has begun to end has ended."""
+        self.back.set()
+        if self.leaving is not None:
+            await self.leaving
+            self.leaving = None
+
+    async def _abandon(self) -> None:
+        await asyncio.gather(*(one.abandon() for one in self.workers))
 
     def _hello(self) -> dict[str, Any]:
         source = self.settings.follow

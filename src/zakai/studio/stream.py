@@ -109,6 +109,7 @@ def take(session: Session, request: Mapping[str, Any], report: Report) -> Answer
         "warnings": [] if last is None else list(last.warnings),
         "log_likelihood": stream.log_likelihood,
         "states": list(stream.state),
+        "method": stream.online.method,
         "first": None if last is None else float(stream.estimates[0].time),
     }, {}
 

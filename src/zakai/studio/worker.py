@@ -8,11 +8,14 @@ from __future__ import annotations
 
 import gc
 import json
+import logging
 import os
 import sys
 import threading
+import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -22,6 +25,9 @@ from zakai.studio.frames import ENVELOPE, packed
 from zakai.studio.session import Session
 from zakai.studio.tasks import carried_out
 
+WATCHED = 0.25  # seconds between checks whether a kernel is compiled
+COMPILED = 1.0  # seconds of a compilation after which it is said
+COMPILING = "Kernels are being compiled, once for this machine; this takes up to a minute."
 FULL = "the computation needs more memory than it may have ({:g} GiB): take a shorter record or a larger tolerance, or start "
 FULL += "zakai studio with a larger --memory"
 
@@ -90,9 +96,48 @@ def main() -> None:
         request = json.loads(line)
         number = int(request["number"])
         report = partial(_report, output, number, request.get("id"))
-        output.send(number, answer(session, request, memory, report), True)
+        with saying(partial(_say, output, number, request.get("id"))):
+            frame = answer(session, request, memory, report)
+        output.send(number, frame, True)
         if request.get("do") in ("run", "smooth", "fit"):
             gc.collect()  # results hold one another
+
+
+@contextmanager
+def saying(say: Callable[[str], None]) -> Iterator[None]:
+    """Say what the work inside logs, such as the time that it takes, and for how long kernels are compiled."""
+    ended, log = threading.Event(), _Log(say)
+    logger = logging.getLogger("zakai")
+    logger.addHandler(log)
+    threading.Thread(target=_watch, args=(say, ended), daemon=True).start()
+    try:
+        yield
+    finally:
+        ended.set()
+        logger.removeHandler(log)
+
+
+class _Log(logging.Handler):
+    def __init__(self, say: Callable[[str], None]):
+        super().__init__(logging.WARNING)
+        self.say = say
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self.say(record.getMessage())
+
+
+def _watch(say: Callable[[str], None], ended: threading.Event) -> None:
+    said = False
+    while not ended.wait(WATCHED):
+        compiled = sys.modules.get("zakai.numerics.compiled")
+        since = None if compiled is None else getattr(compiled, "compiles_since", lambda: None)()
+        compiles = since is not None and time.monotonic() - since > COMPILED
+        if compiles and not said:
+            said = True
+            say(COMPILING)
+        elif said and since is None:
+            said = False
+            say("")
 
 
 def _load() -> None:
@@ -102,6 +147,10 @@ def _load() -> None:
 
 def _report(output: Output, number: int, given: Any, done: int, total: int | None) -> None:
     output.send(number, packed({"id": given, "do": "progress", "done": done, "total": total}), False)
+
+
+def _say(output: Output, number: int, given: Any, text: str) -> None:
+    output.send(number, packed({"id": given, "do": "said", "text": text}), False)
 
 
 if __name__ == "__main__":

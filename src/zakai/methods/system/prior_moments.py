@@ -17,6 +17,7 @@ from zakai.numerics.prior_grid import PriorGrid, prior_grid
 
 _FINER = {1: 32, 2: 4}  # factor of the points of an angle, by the number of states
 _MOST_STATES = 4  # of a density, whose grid must be small
+_VANISHED = 1e-3  # density at an end of a domain, relative to the largest: below the errors of draws
 NO_DIRECTION = 1e-9  # length of a mean direction below which an angle has none
 
 
@@ -59,11 +60,31 @@ def prior_moments(model: Model, prior: Any, theta: np.ndarray) -> tuple[np.ndarr
 
 
 def density_grid(model: Model, prior: DensityPrior, theta: np.ndarray, tolerance: float = 1e-12) -> PriorGrid:
-    """Return a grid for a prior that is given by the logarithm of its density, at the real part of `theta` (p,)."""
-    log_density = numpy_function(prior.log_density, model)
+    """Return a grid for a prior that is given by the logarithm of its density, at the real part of `theta` (p,).
+
+    The density of several states counts inside of the domain only, at whose ends it must vanish.
+
+    Raises:
+        InputError: no grid fits the density, or it does not vanish at an end of the domain.
+    """
+    formula, ends = numpy_function(prior.log_density, model), model.domain if model.n > 1 else {}
+
+    def log_density(x: np.ndarray, t: float, theta: np.ndarray) -> np.ndarray:
+        inside = [interval.contains(x[:, model.state.index(name)]) for name, interval in ends.items()]
+        values = formula(x, t, theta)
+        return np.where(np.all(inside, axis=0), values, -np.inf) if inside else values
+
     periodic = [name in model.periodic for name in model.state]
     source = f"{model.source}: prior: log_density"
-    return prior_grid(lambda x: log_density(x, model.start, theta.real), model.n, periodic, tolerance=tolerance, source=source)
+    grid = prior_grid(lambda x: log_density(x, model.start, theta.real), model.n, periodic, tolerance=tolerance, source=source)
+    shares = np.exp(grid.log_values.real - grid.log_values.real.max())
+    for name, interval in ends.items():
+        i = model.state.index(name)
+        for end in (interval.lower, interval.upper):
+            near = np.abs(grid.points[..., i] - end) <= abs(grid.basis[i, i])
+            if shares[near].max(initial=0.0) > _VANISHED:
+                raise InputError(f"{source} does not vanish at the end {end:g} of the domain of {name!r}")
+    return grid
 
 
 def wrapped(model: Model, points: np.ndarray) -> np.ndarray:

@@ -53,7 +53,15 @@ export class PlaneView extends Panel {
     const when = this.frame.header.clock ? moment(times[k], this.frame.header.clock, span) : `t = ${moment(times[k], null, span)}`;
     this.when.textContent = when;
     this.slider.setAttribute("aria-valuetext", when);
-    this.redraw();
+    const { x, y } = this.frame.header.range;
+    this.setHome(this._reaching(x, 0), this._reaching(y, 1));
+  }
+
+  /** Return the range of an axis, widened where the window of the shown time goes beyond it. */
+  _reaching([low, high], axis) {
+    const { origin, basis } = this.frame.arrays, [a, b] = basis.subarray(4 * this.at + 2 * axis), half = 0.5 * (this.size - 1);
+    const middle = origin[2 * this.at + axis] + (a + b) * half, reach = 0.8 * Math.hypot(a, b) * half;
+    return this.frame.header.periodic[axis] || !Number.isFinite(middle + reach) ? [low, high] : [Math.min(low, middle - reach), Math.max(high, middle + reach)];
   }
 
   /** Return what places index coordinates of the shown time, and back. */

@@ -65,7 +65,7 @@ class Studio {
     } catch (error) {
       if (error instanceof Superseded) return null;
       if (more.quiet) throw error;
-      this.say(error.cancelled ? "Cancelled." : error.message, !error.cancelled);
+      if (!error.cancelled || this.cancelling) this.say(error.cancelled ? "Cancelled." : error.message, !error.cancelled);
       return null;
     } finally {
       end?.();
@@ -200,11 +200,9 @@ class Studio {
     if (!this.model) return;
     if (this.works && !this.tabs.get("compare").kept.length) this.link.drop(); // a run does not wait for what it makes outdated
     if (!this.model.prior) { this.say("The model has no prior: add a table [prior] to filter; it can be analysed without.", true); return; }
-    this.busy(true, "Filtering …");
     this.begun = { at: performance.now(), asked: JSON.stringify(this.request) };
-    const found = await this.ask("run", { ...this.request, name: "main" }, { progress: (done, total) => this.progressed(done, total) });
+    const found = await this.task("run", "Filtering …", { ...this.request, name: "main" });
     this.begun = null;
-    this.busy(false);
     if (!found) return;
     this.summary = found;
     this.remember();
@@ -218,35 +216,37 @@ class Studio {
   _next() {
     if (this.begun?.asked === JSON.stringify(this.request)) return;
     this.again = true;
+    if (!this.begun) this.say(`${this.said} The filter runs after it; Cancel ends it.`);
     if (this.begun && performance.now() - this.begun.at > OUTDATED && !this.tabs.get("compare").kept.length) this.link.tell("cancel");
+  }
+
+  /** Ask for a task that the page is busy with. There is one at a time: another one has to wait, and the status says so. */
+  async task(what, said, request) {
+    if (this.running) { this.say(`${this.said} It has not ended; press Cancel to end it.`); return null; }
+    this.busy(true, said);
+    const found = await this.ask(what, request, { progress: (done, total) => this.progressed(done, total), said: (text) => this.say(`${said} ${text}`) });
+    this.busy(false);
+    return found;
   }
 
   busy(on, said = "") {
     this.running = on;
+    this.said = said;
     byId("run").disabled = on || !this.model;
     this._bar();
     document.body.classList.toggle("busy", on);
-    if (on) this.say(said);
+    if (on) { this.cancelling = false; this.say(said); }
     if (!on && this.again) { this.again = false; setTimeout(() => this.run()); } // what was wanted meanwhile
-    clearTimeout(this.patience);
-    this.compiling = "";
-    if (on) this.patience = setTimeout(() => {
-      if (!this.running || this.reported) return;
-      this.compiling = said;
-      this.say(`${said} The first run on a machine compiles kernels, which takes up to a minute.`);
-    }, 6000);
   }
 
   progressed(done, total) {
     const bar = byId("progress");
     bar.classList.toggle("open", !total);
-    this.reported = Boolean(total);
     if (total) {
       const share = Math.round((100 * done) / total);
       bar.setAttribute("aria-valuenow", share);
       bar.firstElementChild.style.width = `${share}%`;
       bar.title = `${done.toLocaleString("en")} of ${total.toLocaleString("en")}`;
-      if (this.compiling) { this.say(this.compiling); this.compiling = ""; }
     } else { bar.removeAttribute("aria-valuenow"); bar.title = ""; }
   }
 
@@ -292,7 +292,7 @@ class Studio {
     });
     views("text");
     byId("run").addEventListener("click", () => this.run());
-    byId("cancel").addEventListener("click", () => { this.link.tell("cancel"); this.say("Cancelling …"); });
+    byId("cancel").addEventListener("click", () => { this.cancelling = true; this.link.tell("cancel"); this.say("Cancelling …"); });
     document.addEventListener("keydown", (event) => {
       if (event.key === "Enter" && (event.ctrlKey || event.metaKey)) { event.preventDefault(); this.read.now(); this.run(); }
     });

@@ -235,13 +235,13 @@ export class Data {
     return true;
   }
 
-  _sketch({ arrays, names, kind }) {
+  _sketch({ arrays, names, kind, clock }) {
     const { times, values } = arrays, m = names.length;
     if (!this.panel) this.panel = new LinePanel(this.sketch, { label: "The record", height: 130, compact: true });
     if (!this.sketch.isConnected) return;
     const colours = ["series", "truth", "band", "faint"];
     const series = names.slice(0, 4).map((name, j) => ({ role: `y${j}`, text: name, x: times, y: Float32Array.from({ length: times.length }, (_, k) => values[k * m + j]), dots: true, colour: colours[j] }));
-    this.panel.show({ x: { title: "" }, y: { title: m === 1 ? names[0] : kind }, series });
+    this.panel.show({ x: { title: "", clock }, y: { title: m === 1 ? names[0] : kind }, series });
   }
 }
 

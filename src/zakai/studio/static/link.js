@@ -7,7 +7,7 @@ export class Superseded extends Error {}
 export class Link {
   constructor() {
     this.number = 0;
-    this.waiting = new Map(); // number -> {channel, resolve, reject, progress}
+    this.waiting = new Map(); // number -> {channel, resolve, reject, progress, said, work}
     this.latest = new Map(); // channel -> number
     this.onhello = this.onlost = this.onstream = () => {};
     this.tries = 0;
@@ -41,13 +41,14 @@ export class Link {
     const one = this.waiting.get(header.id);
     if (!one) return; // an answer that came late
     if (header.do === "progress") { one.progress?.(header.done, header.total); return; }
+    if (header.do === "said") { one.said?.(header.text); return; }
     this.waiting.delete(header.id);
     if (header.error) one.reject(Object.assign(new Error(header.error), { cancelled: Boolean(header.cancelled) }));
     else one.resolve({ ...header, arrays, shapes });
   }
 
   /** Ask for an answer; a promise, which an error of the studio or a newer request of the channel rejects. */
-  ask(what, request = {}, { channel = what, progress, work } = {}) {
+  ask(what, request = {}, { channel = what, progress, said, work } = {}) {
     const id = ++this.number;
     const before = this.waiting.get(this.latest.get(channel));
     if (before) {
@@ -57,7 +58,7 @@ export class Link {
     this.latest.set(channel, id);
     return new Promise((resolve, reject) => {
       if (this.socket?.readyState !== WebSocket.OPEN) { reject(new Error("the studio does not answer; start it again")); return; }
-      this.waiting.set(id, { channel, resolve, reject, progress, work });
+      this.waiting.set(id, { channel, resolve, reject, progress, said, work });
       this.socket.send(JSON.stringify({ ...request, do: what, id, channel }));
     });
   }

@@ -1,6 +1,6 @@
 // The smaller pictures: lines and bands over time, and a histogram.
 
-import { text } from "./axes.js";
+import { moment, text } from "./axes.js";
 import { Panel, drawSeries } from "./panel.js";
 
 /** Lines, dots and bands: show({x: {title, clock}, y: {title}, series: [{role, text, x, y, lower, upper, dots, dash, colour}], marks}). */
@@ -65,7 +65,8 @@ export class LinePanel extends Panel {
       nearest = one.x[k];
       lines.push(`${one.text || this.axes.y.title} ${text(one.y[k])}`);
     }
-    return lines.length ? { x: nearest, y, lines: [`${this.axes.x.title || "x"} ${text(nearest)}`, ...lines] } : null;
+    const { clock, title } = this.axes.x, when = clock ? moment(nearest, clock, this.view.x[1] - this.view.x[0]) : `${title || "x"} ${text(nearest)}`;
+    return lines.length ? { x: nearest, y, lines: [when, ...lines] } : null;
   }
 }
 

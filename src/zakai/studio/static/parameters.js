@@ -111,9 +111,7 @@ export class Parameters {
 
   async fit() {
     const { studio } = this;
-    studio.busy(true, "Fitting …");
-    const found = await studio.ask("fit", { ...studio.request, intervals: this.intervals.checked });
-    studio.busy(false);
+    const found = await studio.task("fit", "Fitting …", { ...studio.request, intervals: this.intervals.checked });
     if (!found) return;
     studio.say(`Fitted: ${found.message}.`);
     const rows = Object.entries(found.estimates).map(([name, value]) => [name, number(value, 6), number(found.errors[name], 2),
@@ -126,9 +124,7 @@ export class Parameters {
 
   async profile() {
     const { studio } = this, parameter = this.which.value, one = this.inputs[parameter];
-    studio.busy(true, `Profile of ${parameter} …`);
-    const found = await studio.ask("profile", { ...studio.request, parameter, low: one.low, high: one.high, count: 15 }, { progress: (done, total) => studio.progressed(done, total) });
-    studio.busy(false);
+    const found = await studio.task("profile", `Profile of ${parameter} …`, { ...studio.request, parameter, low: one.low, high: one.high, count: 15 });
     if (!found) return;
     studio.say(`The log-likelihood for values of ${parameter}, the others as they are.`);
     const { values, log_likelihood: heights } = found.arrays, best = Math.max(...heights.filter(Number.isFinite));

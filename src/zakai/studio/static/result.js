@@ -66,11 +66,8 @@ export class Result {
   async _choose(name) {
     if (this.available.has(name)) { await this.show(name); return; }
     const { studio } = this;
-    if (studio.running) return;
     if (name === "smooth") {
-      studio.busy(true, "Smoothing …");
-      const found = await studio.ask("smooth", { ...studio.request, name }, { progress: (done, total) => studio.progressed(done, total) });
-      studio.busy(false);
+      const found = await studio.task("smooth", "Smoothing …", { ...studio.request, name });
       if (!found) return;
       studio.say("Smoothed: each density is given all observations, earlier and later.");
       await this.show(name, found);

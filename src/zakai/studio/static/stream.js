@@ -50,7 +50,7 @@ export class Stream {
     if (now - this.drawn < 250 || this.drawing) return; // four pictures a second
     this.drawing = true;
     this.drawn = now;
-    await studio.result.show("stream", { states: header.states, verdict: "", log_likelihood: header.log_likelihood, method: "stream", observations: header.count, warnings: header.warnings, first: header.first, last: header.time });
+    await studio.result.show("stream", { states: header.states, verdict: "", log_likelihood: header.log_likelihood, method: header.method, observations: header.count, warnings: header.warnings, first: header.first, last: header.time });
     this.drawing = false;
   }
 }
