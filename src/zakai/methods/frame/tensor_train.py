@@ -18,7 +18,7 @@ from zakai.models.model import Model
 from zakai.records.schedule import Schedule
 
 FEW_STATES = 3
-TOLERANCES = (5e-3, 2e-2)  # of the mean in standard deviations, for two and three states and for more
+TOLERANCES = (1e-3, 5e-3)  # of the mean in standard deviations, for two and three states and for more
 MOST_RANK, MOST_TOLERANCE = 24, 0.1
 
 
@@ -32,7 +32,7 @@ def prepare(
         model: the system.
         schedule: its K intervals.
         theta: values of the parameters (p,).
-        tolerance: the wanted error of a mean, in standard deviations; by default 5e-3 for two and three states, 2e-2 for more.
+        tolerance: the wanted error of a mean, in standard deviations; by default 1e-3 for two and three states, 5e-3 for more.
         most_rank: the largest rank of a train; a density that needs more is reported.
         choices: those of a run at neighbouring parameters, which are taken again; an empty `Choices()` keeps those of this run.
 
