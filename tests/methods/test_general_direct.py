@@ -92,7 +92,8 @@ def distance(result, reference):
 
 def warned(result):
     """Return the health figures that warn."""
-    return {line.split(" ")[0] for line in result.warnings} & set(general_direct.BOUNDS)
+    words = set(" ".join(result.warnings).replace(",", " ").replace("(", " ").split())
+    return words & set(general_direct.BOUNDS)
 
 
 TIMES = np.cumsum([0.02, 0.05, 0.001, 0.03, 0.04, 0.0002, 0.03, 0.01, 0.02, 0.05])

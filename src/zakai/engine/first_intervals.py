@@ -45,7 +45,7 @@ class FirstIntervals(NamedTuple):
 
     @classmethod
     def of(cls, model: Model, times: Sequence[float], inputs: Inputs | None) -> FirstIntervals:
-        """Return those of a record with these times, as far as they are after the model's start."""
+        """Return those of a record with these times, without times before the start of the model."""
         start = float(model.start)
         later = sorted({float(time) for time in times if time > start})[:INTERVALS]
         if not later:

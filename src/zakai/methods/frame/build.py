@@ -20,8 +20,8 @@ from zakai.numerics.trains.train import Train
 CONTROLS = 600  # with 96 the tails of a skewed density of three states were never seen, at any tolerance
 CLOUD = 1024
 # Shares of the tolerance that a build and one of its cores have.  On 18 records of tracks and oscillators, on which they were
-# chosen, the largest error of a mean without a warning is 1.7 tolerances (2e-2), 4.4 with .6 and .25: errors in tails become those
-# of a mean where later observations lead there.
+# chosen, the largest error of a mean without a warning is 1.7 tolerances (2e-2), 4.4 with .6 and .25: errors in tails become
+# those of a mean where later observations lead there.
 SHARE, CORES = 0.4, 0.2
 LEAST = 0.6  # of the tolerance that earlier errors may leave
 EDGE = 0.3  # share of the tolerance that may be near an end of an axis
