@@ -36,10 +36,10 @@ def distances(setting: Setting, mean: Array, cov: Array, again: Again) -> Array 
 
     Returns:
         The largest relative difference of a mean or a deviation; infinite after the coarser run has lost the density. None where
-        the method has no tolerance, or the coarsest, and where another option is given: it may set an error that no tolerance
-        changes.
+        the method has no tolerance, or the coarsest, or an estimate that is no bound, and where another option is given: it may
+        set an error that no tolerance changes.
     """
-    if "tolerance_ratio" not in setting.method.bounds or "tolerance" not in setting.options:
+    if not setting.method.cautious or "tolerance_ratio" not in setting.method.bounds or "tolerance" not in setting.options:
         return None
     defaults = setting.method.options
     if any(value != defaults.get(name) for name, value in setting.options.items() if name != "tolerance"):

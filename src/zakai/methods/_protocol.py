@@ -215,6 +215,9 @@ class Method(Generic[P, S]):
     makes the option `choices` that the values of one quadratic have in common, so that the jumps are smaller, for a tolerance
     that is as many times larger as its argument says.
 
+    `cautious` says that `error_estimate` is a bound that may be far above the error: where it warns, a run at a coarser tolerance is
+    compared with it.
+
     `absolute` says that what is prepared for an interval depends on where it begins, although the model does not depend on t.
 
     Optional: `variant(model, options)` returns the method with the functions for this model and these options, where those above
@@ -259,6 +262,7 @@ class Method(Generic[P, S]):
     handles: frozenset[str] = frozenset()
     shorter: str = "give fewer observations"
     absolute: bool = False
+    cautious: bool = True
     random: bool = False
     reflects: bool = False
     by_values: Callable[[float], Any] | None = None

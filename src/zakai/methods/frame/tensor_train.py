@@ -83,6 +83,7 @@ METHOD: Method[Prepared, State] = Method(
     bounds=BOUNDS,
     differentiable=False,
     by_values=Choices,
+    cautious=False,
     backward=BACKWARD,
     valid=valid,
     shorter="raise the option tolerance (command: --option tolerance=...)",
