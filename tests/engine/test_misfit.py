@@ -111,3 +111,14 @@ def test_what_an_unexplained_observation_causes_is_a_part_of_its_sentence():
     assert "cannot be explained by the model, " in warning and "a fill value must be nan, in a file NA" in warning
     clause = r"from t = 1.2 on (the density was lost|estimates may be wrong).*tolerance_ratio exceeds 1 at \d times"
     assert re.search(clause, warning)
+
+
+def test_a_smoother_says_it_too():
+    model = zakai.Model(
+        state=["x"], drift=["-x"], observation=["x"], observation_kind="samples", observation_noise=[["0.01"]],
+        prior={"kind": "gaussian", "mean": [0.0], "cov": [[1.0]]},
+    )  # fmt: skip
+    record = zakai.Record([0.1, 0.2, 0.3], [0.1, -999.0, 0.1], "samples")
+    smoothed = zakai.smooth(model, record)
+    assert any("cannot be explained by the model" in one for one in smoothed.warnings)
+    assert sum("cannot be explained" in one for one in smoothed.warnings) == 1

@@ -146,6 +146,7 @@ class Run:
                 *self.empty.notes,
             ]
         )
+        self.misfit: list[str] = []  # sentences on observations that the filter cannot explain
         self.bytes = 0
         self.done = 0
         self.steps = 0  # of the segment that has begun

@@ -66,6 +66,7 @@ def result_of_run(run: Run, why: str, considered: Mapping[str, tuple[Condition, 
     undefined += notes_on_escape(method.name, noted, schedule, theta, result.mean, result.cov)
     lengths = notes_on_lengths(schedule, distances)
     misfit, first = notes_on_law(noted, theta, schedule, run.values, infos, (result.bounds, method.losses))
+    run.misfit = run.misfit or misfit
     result.warnings.extend([*undefined, *run.notes, *lengths, *misfit, *run.health_warnings(_until(result, first))])
     return run.complete(result)
 

@@ -314,7 +314,7 @@ class SmoothingRun(Run):
             result.bounds = {**result.bounds, "evidence_error": (self.backward.accuracy(self.empty), _EVIDENCE)}
         if result.mean_standard_error is not None and self.start.mean_standard_error is not None:
             result.mean_standard_error[0] = self.start.mean_standard_error
-        result.warnings = [*self.notes, *super().health_warnings(result)]
+        result.warnings = [*self.notes, *self.misfit, *super().health_warnings(result)]
         result.increment_law_error = None  # `smooth` gives that of the filter
         return result
 
