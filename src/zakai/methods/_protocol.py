@@ -215,8 +215,8 @@ class Method(Generic[P, S]):
     makes the option `choices` that the values of one quadratic have in common, so that the jumps are smaller, for a tolerance
     that is as many times larger as its argument says.
 
-    `cautious` says that `error_estimate` is a bound that may be far above the error: where it warns, a run at a coarser tolerance is
-    compared with it.
+    `cautious` says that `error_estimate` is a bound that may be far above the error: where it warns, a run at a coarser tolerance
+    is compared with it.
 
     `absolute` says that what is prepared for an interval depends on where it begins, although the model does not depend on t.
 
