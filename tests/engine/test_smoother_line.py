@@ -327,7 +327,7 @@ def test_a_double_well_is_smoothed_from_a_broad_prior(variance):
 
 
 def test_a_law_whose_density_underflows_is_smoothed_by_both_methods():
-    # A rounded reading: beyond a few deviations of the noise erf - erf is zero, and its logarithm minus infinity.
+    # A quantised sensor: beyond a few deviations of the noise erf - erf is zero, and its logarithm minus infinity.
     law = "log(erf((z + 0.25 - x)/0.0707) - erf((z - 0.25 - x)/0.0707)) - log(2)"
     model = zakai.Model(
         state=["x"], drift=["-(x - 1)/4"], diffusion=[["0.3"]], observed=["z"], observation_kind="samples",
