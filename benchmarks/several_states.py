@@ -19,6 +19,7 @@ import numpy as np
 
 import zakai
 from zakai.models.numeric import numpy_function
+from zakai.studies import tracking
 
 
 def columns(n, entries):
@@ -33,30 +34,6 @@ def system(state, drift, noise, observation, errors, mean, variances, **more):
         observation_noise=np.diag(errors).tolist(),
         prior={"kind": "gaussian", "mean": mean, "cov": np.diag(variances).tolist()}, **more,
     )  # fmt: skip
-
-
-def bearings():
-    """Two sensors far apart are not there: one observer that moves on a circle sees a bearing."""
-    return system(
-        ["px", "py", "vx", "vy"], ["vx", "vy", "0", "0"], {2: 0.12, 3: 0.12},
-        ["atan2(py - 1.2*sin(0.8*t), px - 1.2*cos(0.8*t))"], [0.003], [6.0, 5.0, -0.6, 0.2], [6.0, 6.0, 0.2, 0.2],
-    ), times(25, 0.1, 0.6)  # fmt: skip
-
-
-def radar():
-    """Range and bearing of a target that moves on a line."""
-    return system(
-        ["px", "py", "vx", "vy"], ["vx", "vy", "0", "0"], {2: 0.25, 3: 0.25}, ["sqrt(px**2 + py**2)", "atan2(py, px)"],
-        [0.06, 0.003], [7.0, 5.0, -0.7, 0.2], [3.0, 3.0, 0.4, 0.4],
-    ), times(25, 0.1, 0.6)  # fmt: skip
-
-
-def turn():
-    """A target that turns at an unknown rate."""
-    return system(
-        ["px", "py", "vx", "vy", "w"], ["vx", "vy", "-w*vy", "w*vx", "-0.1*w"], {2: 0.2, 3: 0.2, 4: 0.15},
-        ["sqrt(px**2 + py**2)", "atan2(py, px)"], [0.08, 0.003], [6.0, 6.0, -0.9, 0.4, 0.25], [1.5, 1.5, 0.4, 0.4, 0.15],
-    ), times(25, 0.1, 0.6)  # fmt: skip
 
 
 def reentry():
@@ -97,7 +74,8 @@ def times(count, low, high):
     return np.cumsum(np.random.default_rng(11).uniform(low, high, count))
 
 
-SYSTEMS = {f.__name__: f for f in (radar, bearings, turn, reentry, robot, duffing, squares)}
+SYSTEMS = {name: lambda model=model: (model(), times(25, 0.1, 0.6)) for name, model in tracking.SYSTEMS.items()}
+SYSTEMS |= {f.__name__: f for f in (reentry, robot, duffing, squares)}
 
 
 def bootstrap(model, record, count, seed, longest=0.05):
