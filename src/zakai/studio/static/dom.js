@@ -67,7 +67,9 @@ const ALLOWED = new Set(["DIV", "P", "I", "SUB", "MATH", "MROW", "MI", "MN", "MO
   "MFENCED", "MTABLE", "MTR", "MTD", "MSPACE", "MSTYLE", "MOVER", "MUNDER", "MUNDEROVER", "MPADDED"]);
 const ATTRIBUTES = new Set(["displaystyle", "mathvariant", "width", "class", "close", "open", "separators", "linethickness"]);
 
-/** Put text with MathML into an element: of the elements in it only those of formulas. */
+const SMALLEST = 0.6; // of the size of a formula; a wider one is scrolled
+
+/** Put text with MathML into an element: of the elements in it only those of formulas, smaller where they are too wide. */
 export function formulas(target, text) {
   const parsed = new DOMParser().parseFromString(text, "text/html");
   for (const element of [...parsed.body.querySelectorAll("*")]) {
@@ -75,4 +77,8 @@ export function formulas(target, text) {
     for (const { name } of [...element.attributes]) if (!ATTRIBUTES.has(name)) element.removeAttribute(name);
   }
   target.replaceChildren(...parsed.body.childNodes);
+  for (const formula of target.querySelectorAll("math")) {
+    const room = target.clientWidth / formula.getBoundingClientRect().width;
+    if (room < 1) formula.style.fontSize = `${Math.max(SMALLEST, 0.98 * room) * parseFloat(getComputedStyle(formula).fontSize)}px`;
+  }
 }
