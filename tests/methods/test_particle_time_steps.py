@@ -107,6 +107,19 @@ def test_the_noise_of_a_substep_in_which_an_input_jumps_has_the_rates_of_both_si
     assert (np.abs(result.mean - exact.mean)[1:] / np.sqrt(exact.variance[1:])).max() < 0.03
 
 
+@pytest.mark.parametrize("beside", [-1e-14, 0.0, 1e-15])
+def test_an_input_that_is_given_at_the_middle_of_a_substep_leaves_all_of_its_noise(beside):
+    model = zakai.Model(
+        state=["a", "w"], drift=["w - a**3", "T"], diffusion=[["0"], ["0.5"]], observation=["w"], inputs=["T"],
+        observation_kind="samples", observation_noise=[["0.01"]],
+        prior={"kind": "gaussian", "mean": [0.0, 0.0], "cov": [0.01, 0.0025]},
+    )  # fmt: skip
+    times = 0.2 * np.arange(1, 11)
+    inputs = zakai.Inputs(np.append(0.0, 0.1 * np.arange(1, 20) + beside), np.zeros(20))
+    result = zakai.filter(model, zakai.Record(times, np.full(10, np.nan), "samples", inputs=inputs), PARTICLES, particles=20000)
+    assert result.variance[1:, 1] == pytest.approx(0.0025 + 0.25 * times, rel=0.05)
+
+
 def test_dry_friction_near_rest_needs_no_shorter_steps_than_the_noise():
     # Near zero every step is too long for the sign of the velocity, relative to the velocity.
     model = zakai.Model(

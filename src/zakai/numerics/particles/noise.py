@@ -187,11 +187,9 @@ def _noise_across(times: Array, slopes: Array, e: int, G: Array, length: float, 
         M[:] = 0.0
         for i in range(n):
             M[i, i] = 1.0
-        f, now, source = e if side < 0 else e + 1, middle, e
-        while 0 <= f < times.shape[0]:
-            own = now - max(times[f, 0], middle - 0.5 * length) if side < 0 else min(times[f, 1], middle + 0.5 * length) - now
-            if own <= 0.0:
-                break
+        f, source, first, last = e if side < 0 else e + 1, e, middle - 0.5 * length, middle + 0.5 * length
+        while 0 <= f < times.shape[0] and times[f, 1] > first and times[f, 0] < last:
+            own = min(times[f, 1], last) - max(times[f, 0], first)
             _reduced(slopes[source], own, A)
             noise_about(A, G, own, Q)
             _exponential(A, -0.5 * side * own, E)
@@ -201,7 +199,7 @@ def _noise_across(times: Array, slopes: Array, e: int, G: Array, length: float, 
             for i in range(n):
                 for j in range(n):
                     out[i, j] += E[i, j]
-            f, now = f + side, now + side * own
+            f += side
             source = f
 
 
