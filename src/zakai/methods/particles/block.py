@@ -20,6 +20,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from zakai.methods.particles.events import Events
 from zakai.methods.particles.programs import Array
 from zakai.methods.particles.window import MOST, Target, Window, joined
 from zakai.numerics.particles.even import Even
@@ -29,14 +30,46 @@ from zakai.numerics.particles.population import effective, normalised
 # and 0.45 with eight intervals.
 LONGEST = 8
 TRIED, FEW = 16, 128  # what is expensive is tried on one particle in so many, where these are as many at least
-_KEEP = (1.0, 1.0, 0.0, 0.0, 0.0)  # power, change, no sweeps, rho, share of plain noise: weights of the noise as it is
+_KEEP = (1.0, 1.0, 0.0, 0.0, 0.0, 0.0)  # power, change, no sweeps, rho, share of plain noise: weights of the noise as it is
+
+
+class Past(NamedTuple):
+    """The last intervals: their events and observations, the states (n, N) before them, the noise (D, N) in them, and its law."""
+
+    events: tuple[Events, ...]
+    observed: tuple[Array, Array, Array]
+    start: Array
+    path: Array
+    law: Target
+
+    def whole(self, target: Target) -> Target:
+        """Return the law of the noise in these intervals and in a new one."""
+        now = target.times, target.given, target.counted
+        times, given, counted = (np.concatenate(pair) for pair in zip(self.observed, now, strict=True))
+        return replace(self.law, events=joined((*self.events, target.events)), times=times, given=given, counted=counted)
+
+
+def past_of(window: Window, target: Target) -> Past | None:
+    """Return the last intervals that are taken together with a new one, None where there are none."""
+    count, width = 0, target.events.width
+    while count < min(window.length, LONGEST) and width + len(window.noises[window.length - 1 - count]) <= MOST:
+        count += 1
+        width += len(window.noises[window.length - count])
+    if count == 0:
+        return None
+    motion, rows = target.motion, slice(window.length - count, window.length)
+    observed = window.times[rows], window.given[rows], window.counted[rows]
+    _, start, path = window.last(motion, count)
+    events = window.events[rows]
+    return Past(events, observed, start, path, Target(motion, joined(events), *observed, None, start))
 
 
 class Block(NamedTuple):
     """Noise that is drawn again in the last intervals and in the new one.
 
-    So many `intervals` before the new one have new noise, `path` (D, N) is all of it, drawn from `gaussian` for the law `target`,
-    `particles` (n, N) are the states after it, `logs` (N,) the log weights, of which `earlier` (N,) is the part of the old noise.
+    So many `intervals` before the new one have new noise, `path` (D, N) is all of it, for the law `target`, `particles` (n, N)
+    are the states after it, and `logs` (N,) the log weights, of which `earlier` (N,) is the part of the old noise; `path` was
+    drawn from `gaussian`.
     """
 
     intervals: int
@@ -48,35 +81,22 @@ class Block(NamedTuple):
     earlier: Array
 
 
-def drawn_again(window: Window, logs: Array, target: Target, share: float, even: Even, least: float) -> Block | None:
+def drawn_again(past: Past, logs: Array, target: Target, share: float, even: Even, least: float) -> Block | None:
     """Return particles whose noise in the last intervals is drawn again, None where that leaves too few of them.
 
     That is tried on one particle in `TRIED`.
 
     Args:
-        window: their past, before the new interval.
+        past: the last intervals.
         logs: log weights of the particles (N,).
         target: the law of the noise of the new interval.
         share: of plain noise in q_k.
         even: what makes normal numbers.
         least: effective share of the particles.
     """
-    weights = np.exp(logs)
-    count, width = 0, target.events.width
-    while count < min(window.length, LONGEST) and width + len(window.noises[window.length - 1 - count]) <= MOST:
-        count += 1
-        width += len(window.noises[window.length - count])
-    if count == 0:
-        return None
-    motion, rows = target.motion, slice(window.length - count, window.length)
-    events, observed = window.events[rows], (window.times[rows], window.given[rows], window.counted[rows])
-    _, start, path = window.last(motion, count)
-    past = Target(motion, joined(events), *observed, None, start)
-    now = target.times, target.given, target.counted
-    times, given, counted = (np.concatenate(pair) for pair in zip(observed, now, strict=True))
-    whole = replace(past, events=joined((*events, target.events)), times=times, given=given, counted=counted)
+    weights, whole, start, path = np.exp(logs), past.whole(target), past.start, past.path
     begin = np.append(path @ weights, np.zeros(target.events.width))[:, None]
-    before, after = past.gaussian(path, weights, wider=1.0), whole.gaussian(begin, weights)
+    before, after = past.law.gaussian(path, weights, wider=1.0), whole.gaussian(begin, weights)
     if before is None or after is None:
         return None
 
@@ -85,7 +105,7 @@ def drawn_again(window: Window, logs: Array, target: Target, share: float, even:
         target = replace(whole, start=start)
         new, ratio = target.draw(after, share, even)
         particles, logs = target.follow(new)
-        _, _, old, _, _ = replace(past, start=start).sweep(before, path, _KEEP, even.key)
+        _, _, old, _, _ = replace(past.law, start=start).sweep(before, path, _KEEP, even.key)
         logs += ratio - old
         logs[~np.isfinite(particles).all(axis=0) | np.isnan(logs)] = -np.inf
         return new, particles, logs, -old
@@ -96,7 +116,7 @@ def drawn_again(window: Window, logs: Array, target: Target, share: float, even:
         found = logs[few] + drawn(np.ascontiguousarray(start[:, few]), np.ascontiguousarray(path[:, few]), own)[2]
         if not effective(normalised(found)[0]) > least * len(found):
             return None
-    return Block(count, whole, after, *drawn(start, path, even))
+    return Block(len(past.events), whole, after, *drawn(start, path, even))
 
 
 def with_block(window: Window, target: Target, count: int, path: Array) -> Window:

@@ -43,7 +43,7 @@ DOUBTFUL = 16  # resamplings after an interval that left few particles, in which
 # of the last, and in a step its own and as many as the rest of it takes.  (Measured: 30 to 38 ns in a move, 0.3 us and 40 ns a
 # number in a step.)
 MOVE_GAIN, MOVE_WORTH, FORGOTTEN, STEP_WORK, LEAST_RATE = 1.5, 8.0, 0.98, 4.0, 0.3
-MOVE_CONTROL = (1.0, 1.2, 4.0, 0.4, 1.0)  # power, change, most sweeps, rho, share
+MOVE_CONTROL = (1.0, 1.2, 4.0, 0.4, 1.0, 0.0)  # power, change, most sweeps, rho, share, of all observations
 VARIANCE = 5.0  # that of a mean times N, in variances of the state, that the number of particles is chosen for
 MOST_GROWTH = 4
 REPEATED, NARROWEST = 2.0, 0.02  # excess of the time error at which an interval is repeated, and least narrowing that counts

@@ -110,8 +110,8 @@ BOUNDS = {
         "observation left few particles or few ancestors; run another seed and compare, or name more particles",
     ),
     "tempering_levels": (
-        6.0, "powers of the likelihood that one observation needed: it is far from what was predicted; check it and its noise, "
-        "or give more frequent observations",
+        4.0, "powers of the likelihood that one observation needed: it is far from what was predicted, and the log-likelihood less "
+        "sure than its standard error says; check it and its noise, or give more frequent observations",
     ),
     "largest_weight": (
         0.5, "one particle has most of the weight: none is near the observation; check it and its noise, or name more particles",

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zakai.methods.particles.block import Block, drawn_again, with_block
+from zakai.methods.particles.block import Block, drawn_again, past_of, with_block
 from zakai.methods.particles.events import Events, Observed
 from zakai.methods.particles.moments import moments_of
 from zakai.methods.particles.programs import Array
@@ -115,12 +115,14 @@ def advanced(
     hopeless = plain.unseen and size < HOPELESS * count
     below = HOPELESS if plain.unseen else TEMPER_BELOW if resting else GUIDE_BELOW
     if size < below * count and not moving:
-        least = max(BLOCK_GAIN * size / count, TEMPER_BELOW)
-        block = drawn_again(cloud.window, cloud.logs, target, GUIDE_SHARE, even, 0.0 if hopeless else least)
+        least, past = max(BLOCK_GAIN * size / count, TEMPER_BELOW), past_of(cloud.window, target)
+        block = past and drawn_again(past, cloud.logs, target, GUIDE_SHARE, even, 0.0 if hopeless else least)
         drawn = block and _in_block(cloud, plain, block)
         if drawn and effective(drawn.after.weights) > least * count:
             return drawn.after
-        best = drawn if drawn and hopeless else best
+        if hopeless and past:  # powers of the weights move the past, from where they leave more particles
+            plainly = Drawn(plain, past.whole(target), np.concatenate([past.path, noise]), logs, None, len(past.events))
+            best = drawn if drawn and effective(drawn.after.weights) > size else plainly
         best = best._replace(after=best.after._replace(block=-1))
     few = HOPELESS * count if plain.unseen else min(TEMPER_BELOW * count, TEMPER_FLOOR)
     if size >= few or not np.isfinite(best.logs).any() or plain.unseen and not best.intervals:
@@ -195,7 +197,7 @@ def _tempered(prepared: Prepared, cloud: Cloud, drawn: Drawn, number: int) -> Ad
             n, D = target.start.shape[0], len(path)
             gaussian = (np.zeros(D), np.zeros((D, n)), np.zeros(n), np.zeros((0, D)), np.zeros(0))
         own = prepared.key(number, LEVELS, levels)
-        path, particles, logs, rate, _ = target.sweep(gaussian, path, (high, *control, 0.4, share), own)
+        path, particles, logs, rate, _ = target.sweep(gaussian, path, (high, *control, 0.4, share, float(fixed is None)), own)
         logs = logs + earlier
         rates.append(rate)
     window = cloud.window

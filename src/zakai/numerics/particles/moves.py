@@ -54,8 +54,8 @@ class WindowLaw(NamedTuple):
 class Paths(NamedTuple):
     """The particles that `sweep` moves: the states (n, N) at the start of the window and the noise (D, N), which is replaced.
 
-    It writes the states (n, N) at the end, log N(0, I) L / q (N,), and of each chunk the mean acceptance and the change (chunks,
-    2).
+    It writes the states (n, N) at the end, the logarithms (N,) of what has the power, and of each chunk the mean acceptance and
+    the change (chunks, 2).
     """
 
     start: Array
@@ -92,11 +92,12 @@ PATHS = types.NamedTuple((F2, F2, F2, F1, F2), Paths)
 
 @helper
 def _follow(
-    window: Any, workspace: Any, start: Array, path: Array, x: Array, total: Array, seen: Array, size: int
+    window: Any, workspace: Any, start: Array, path: Array, x: Array, total: Array, past: Array, seen: Array, size: int
 ) -> None:
     """Write the states x (rows, size) at the end of a window and the log-likelihoods (size,) of what is observed in it.
 
-    `seen` (n, size) receives the states at the last observation, before they are updated by it; it may have no rows.
+    `past` (size,) receives those without the last observation, `seen` (n, size) the states at that, before they are updated by
+    it; it may have no rows.
     """
     motion, events, observed, prior = window
     blocks, buffers = workspace
@@ -113,7 +114,7 @@ def _follow(
         for i in range(size):
             x[d, i] = 0.0
     for i in range(size):
-        total[i] = 0.0
+        total[i] = past[i] = 0.0
     own = path[d0:]
     for e in range(places.shape[0]):
         run_event(motion, events, e, blocks, x, own, buffers, size)
@@ -123,15 +124,17 @@ def _follow(
         for d in range(seen.shape[0]):
             for i in range(size):
                 seen[d, i] = x[d, i]
-        if counted[k].sum() == 0.0:
-            continue
-        load_point(law, blocks[3], x, motion[2], times[k], given[k], size)
-        run_program(law, blocks[3], size)
+        if counted[k].sum() > 0.0:
+            load_point(law, blocks[3], x, motion[2], times[k], given[k], size)
+            run_program(law, blocks[3], size)
         for term in range(law[3].size):
             if counted[k, term] != 0.0:
                 values = blocks[3][law[3][term]]
                 for i in range(size):
                     total[i] += values[i]
+        if k == times.size - 2:
+            for i in range(size):
+                past[i] = total[i] + (x[n, i] if rows > n else 0.0)
     for i in range(size):
         if rows > n:
             total[i] += x[n, i]
@@ -193,7 +196,7 @@ def follow(window: Any, start: Array, path: Array, low: int, high: int, out: Arr
     """Write the states (n, N) at the end of a window and the log-likelihoods (N,), for the noise (D, N) from given starts."""
     n, D = start.shape[0], path.shape[0]
     workspace = _workspace(window)
-    x, found = np.empty((window.motion[0][3].size, BLOCK)), np.empty(BLOCK)
+    x, found, past = np.empty((window.motion[0][3].size, BLOCK)), np.empty(BLOCK), np.empty(BLOCK)
     own, begin = np.empty((D + 1, BLOCK)), np.empty((n, BLOCK))
     for first in range(low, high, BLOCK):
         size = min(BLOCK, high - first)
@@ -203,7 +206,7 @@ def follow(window: Any, start: Array, path: Array, low: int, high: int, out: Arr
         for r in range(D):
             for i in range(size):
                 own[r, i] = path[r, first + i]
-        _follow(window, workspace, begin, own, x, found, own[:0], size)
+        _follow(window, workspace, begin, own, x, found, past, own[:0], size)
         for d in range(n):
             for i in range(size):
                 out[d, first + i] = x[d, i]
@@ -217,7 +220,7 @@ def propagate(window: Any, even: Any, start: Array, low: int, high: int, after: 
     noise, states, seen, gained = after
     n, D, lost = start.shape[0], noise.shape[0], 0
     workspace = _workspace(window)
-    x, found = np.empty((window.motion[0][3].size, BLOCK)), np.empty(BLOCK)
+    x, found, past = np.empty((window.motion[0][3].size, BLOCK)), np.empty(BLOCK), np.empty(BLOCK)
     own, begin, at = np.empty((D + 1, BLOCK)), np.empty((n, BLOCK)), np.empty((seen.shape[0], BLOCK))
     for first in range(low, high, BLOCK):
         size = min(BLOCK, high - first)
@@ -225,7 +228,7 @@ def propagate(window: Any, even: Any, start: Array, low: int, high: int, after: 
         for d in range(n):
             for i in range(size):
                 begin[d, i] = start[d, first + i]
-        _follow(window, workspace, begin, own, x, found, at, size)
+        _follow(window, workspace, begin, own, x, found, past, at, size)
         for r in range(D):
             for i in range(size):
                 noise[r, first + i] = own[r, i]
@@ -299,9 +302,9 @@ def sweep(window: Any, gaussian: Any, control: Array, key: Array, low: int, high
     Args:
         window: the law of the noise.
         gaussian: the Gaussian in which moves are reversible.
-        control: the power, the sum of acceptance (1 - rho^2) after which it is enough, the most sweeps, the first rho, and the
-            share of N(0, I) in q = share N(0, I) + (1 - share) Gaussian; the target is q (N(0, I) L / q)^power, with share one
-            N(0, I) L^power.
+        control: the power, the sum of acceptance (1 - rho^2) after which it is enough, the most sweeps, the first rho, the
+            share of N(0, I) in q = share N(0, I) + (1 - share) Gaussian, and whether the power is that of the last observation
+            alone; the target is q (N(0, I) L / q)^power, with share one N(0, I) L^power, times the other likelihoods.
         key: of the random numbers.
         low: the first particle, a multiple of `CHUNK`.
         high: the particle after the last one.
@@ -309,13 +312,13 @@ def sweep(window: Any, gaussian: Any, control: Array, key: Array, low: int, high
     """
     start, path, out, total, moved = paths
     n, D = start.shape[0], path.shape[0]
-    power, enough, most, part = control[0], control[1], int(control[2]), control[4]
+    power, enough, most, part, alone = control[0], control[1], int(control[2]), control[4], control[5] > 0.0
     log_det = 0.0
     for factor in gaussian[4]:
         log_det += math.log(factor)
     workspace = _workspace(window)
     along = np.empty((gaussian[4].size, BLOCK))
-    x, found = np.empty((window.motion[0][3].size, BLOCK)), np.empty(BLOCK)
+    x, found, past = np.empty((window.motion[0][3].size, BLOCK)), np.empty(BLOCK), np.empty(BLOCK)
     begin, new, fresh, m = np.empty((n, BLOCK)), np.empty((D + 1, BLOCK)), np.empty((D, BLOCK)), np.empty((D, BLOCK))
     w, target = np.empty((D, CHUNK)), np.empty(CHUNK)
     gs, phis, taken = np.empty(BLOCK), np.empty(BLOCK), np.empty(BLOCK, np.bool_)
@@ -345,15 +348,16 @@ def sweep(window: Any, gaussian: Any, control: Array, key: Array, low: int, high
                 for r in range(D if turn >= 0 else 0):
                     for i in range(size):
                         new[r, i] += m[r, i]
-                _follow(window, workspace, begin, new, x, found, new[:0], size)
+                _follow(window, workspace, begin, new, x, found, past, new[:0], size)
                 _norms(fresh, D, log_det, gs, size)
                 _norms(new, D, 0.0, phis, size)
                 for i in range(size):
                     g, phi = gs[i], phis[i]
                     top = max(g, phi)
                     q = phi if part == 1.0 else top + math.log((1.0 - part) * math.exp(g - top) + part * math.exp(phi - top))
-                    found[i] += phi - q
-                    value = power * found[i] + q - g
+                    kept = past[i] if alone else 0.0
+                    found[i] = found[i] + phi - q - kept if kept > -np.inf else -np.inf
+                    value = kept + power * found[i] + q - g
                     if not value < np.inf:
                         value = -np.inf
                     taken[i] = turn < 0
