@@ -553,3 +553,11 @@ def test_the_past_moves_from_plain_noise_where_its_gaussian_is_far_off():
     # Three bootstrap filters with 250,000 particles: -5.23, -5.16, -5.20.  From the Gaussian of the past: -8.3 to -11.7.
     assert abs(np.mean(gained) + 5.2) < 0.8 and np.max(np.abs(np.add(gained, 5.2))) < 2.5
     assert all("tempering_levels" in " ".join(result.warnings) for result in results)
+
+
+def test_a_smoother_warns_of_large_standard_errors():
+    model = zakai.Model(**{"observation_kind": "samples", **OSCILLATOR, "observation": ["x"], "observation_noise": [["0.25"]]})
+    result = zakai.smooth(model, record_of(model, 20, 0.3), PARTICLES, particles=60)
+    share = (result.mean_standard_error / np.sqrt(result.variance)).max()
+    assert np.nanmax(result.health["monte_carlo_error"]) == pytest.approx(share) and share > 0.1
+    assert "monte_carlo_error exceeds 0.1" in " ".join(result.warnings)

@@ -199,7 +199,9 @@ def smoothed(prepared: Prepared, state: State, later: Message) -> tuple[Message,
         mean, _, cov = moments(draws, np.full(draws.shape[1], 1.0 / draws.shape[1]), prepared.system.angles)
     _, deviations, _ = moments(draws, np.full(draws.shape[1], 1.0 / draws.shape[1]), prepared.system.angles)
     errors = np.sqrt(later.past.variances(deviations) + state.shift**2)
-    health = {"draws": float(draws.shape[1]), "joined": later.joined}
+    spread = np.sqrt(np.diag(cov))
+    worst = float((errors / np.where(spread > 0, spread, np.inf)).max())
+    health = {"draws": float(draws.shape[1]), "joined": later.joined, "monte_carlo_error": worst}
     return later, Info(np.nan, mean, cov, health, errors, np.nan)
 
 
