@@ -212,6 +212,10 @@ def _step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[Stat
         "linear_states": float(system.linear),
         "substeps": float(steps.scheme.substeps),
     }
+    if system.outside:
+        u = None if interval.inputs is None else interval.inputs.at(interval.stop, system.model.input_hold)
+        beyond = system.outside(cloud.particles[:n].T, interval.stop, prepared.theta, u)
+        health["outside_tables"] = float(weights[beyond].sum() / weights.sum())
     info = Info(done.gained, end.mean[:n], cov, health, np.sqrt(variance + shift**2), float(np.sqrt(evidence)))
     failed = 0 if done.block > 0 else min(max(2 * control.failed, 1), MOST_RESTS) if done.block else control.failed
     rest = failed if done.block else max(control.rest - 1, 0)

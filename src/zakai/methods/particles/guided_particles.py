@@ -110,13 +110,14 @@ BOUNDS = {
         "observation left few particles or few ancestors; run another seed and compare, or name more particles",
     ),
     "tempering_levels": (
-        4.0, "powers of the likelihood that one observation needed: it is far from what was predicted, and the log-likelihood less "
-        "sure than its standard error says; check it and its noise, or give more frequent observations",
+        4.0, "powers of the likelihood that one observation needed: it is far from what was predicted, and the log-likelihood "
+        "less sure than its standard error says; check it and its noise, or give more frequent observations",
     ),
     "largest_weight": (
         0.5, "one particle has most of the weight: none is near the observation; check it and its noise, or name more particles",
     ),
     "time_error": (0.1, "shift of a mean by the time step, in standard deviations; give more frequent observations"),
+    "outside_tables": (1e-3, "share of the mass where a table is constant beyond its range"),
     "log_likelihood_error": (1.0, "standard error of the log-likelihood so far; name more particles before comparing models"),
 }  # fmt: skip
 

@@ -18,6 +18,7 @@ import sympy as sp
 
 from zakai.methods.particles.law import Law, Numbers
 from zakai.methods.particles.programs import Array, Expressions
+from zakai.methods.system.outside_tables import OutsideTables
 from zakai.methods.system.prior_moments import density_grid, prior_moments
 from zakai.models.kept import kept
 from zakai.models.model import Model
@@ -54,6 +55,7 @@ class System:
         self.factor: Expressions | None = None
         self.update: Expressions | None = None  # of the state by an observation
         self.linear = 0  # the number of states of which particles carry the mean and the covariance
+        self.outside = OutsideTables(model)
         self._set_formulas()
         self.box = (np.full(n, -np.inf), np.full(n, np.inf))
         for name, interval in model.domain.items():
