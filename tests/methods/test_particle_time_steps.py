@@ -129,3 +129,16 @@ def test_dry_friction_near_rest_needs_no_shorter_steps_than_the_noise():
     record = zakai.Record(0.25 * np.arange(1, 9), [0.1, 0.05, -0.1, 0.0, 0.1, 0.2, 0.1, 0.0], "samples")
     result, exact = zakai.filter(model, record, PARTICLES, particles=5000), zakai.filter(model, record, "yau-yau")
     assert (np.abs(result.mean - exact.mean)[1:] / np.sqrt(exact.variance[1:])).max() < 0.06
+
+
+def test_a_stiff_state_that_particles_carry_as_a_gaussian_is_judged_by_its_deviation_at_the_end():
+    model = zakai.Model(
+        state=["s", "v"], drift=["-0.2", "(0.02 - v)/0.02"], diffusion=[["0.05", "0"], ["0", "0.01"]],
+        observation=["exp(s) - v"], observation_kind="samples", observation_noise=[["0.0004"]],
+        prior={"kind": "gaussian", "mean": [0.0, 0.0], "cov": [0.01, 1e-2]},
+    )  # fmt: skip
+    record = zakai.Record([0.25, 0.3, 0.5, 1.0], [0.9, 0.95, 0.9, 0.8], "samples")
+    result, exact = zakai.filter(model, record, PARTICLES, particles=20000), zakai.filter(model, record, "yau-yau")
+    assert result.health["linear_states"][1] == 1
+    assert (np.abs(result.mean - exact.mean)[1:] / np.sqrt(exact.variance[1:])).max() < 0.05
+    assert np.nanmax(result.health["time_error"]) < 0.05

@@ -154,6 +154,11 @@ class ConditionalSystem(System):
         self.n = model.n + more
         self.box = (np.append(self.box[0], np.full(more, -np.inf)), np.append(self.box[1], np.full(more, np.inf)))
         self.angles = np.append(self.angles, np.zeros(more, bool))
+        for k, (i, j) in enumerate(self.block.pairs):
+            if i == j:
+                self.owners[linear[i], 2] = model.n + k
+        others = [(linear[i], linear[j], -1) for i, j in self.block.pairs]
+        self.owners = np.append(self.owners, np.array(others).reshape(-1, 3), axis=0)
         self.affine = False
 
     def _set_formulas(self) -> None:

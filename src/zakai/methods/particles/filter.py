@@ -47,6 +47,7 @@ MOVE_CONTROL = (1.0, 1.2, 4.0, 0.4, 1.0, 0.0)  # power, change, most sweeps, rho
 VARIANCE = 5.0  # that of a mean times N, in variances of the state, that the number of particles is chosen for
 MOST_GROWTH = 4
 REPEATED, NARROWEST = 2.0, 0.02  # excess of the time error at which an interval is repeated, and least narrowing that counts
+SURELY = 2.0  # inverse of the error of a regression on a direction, below which that is not known
 
 
 def init(prepared: Prepared, prior: Any) -> State:
@@ -181,7 +182,7 @@ def _step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[Stat
         floor = (remains - own_loss) * max(1.0, MOVE_GAIN * remains / loss) ** 2
     # What the weights say of a coordinate makes a shift of the prediction smaller by the ratio of the variances.
     contraction = np.where(done.predicted > 0, np.minimum(1.0, end.spread / np.maximum(done.predicted, 1e-300)) ** 2, 1.0)[:n]
-    carried, fresh = T @ state.shift, steps.shift[:n]
+    carried, fresh = T @ _known_part(state.shift, before.particles.cov, np.diag(before.cov), size), steps.shift[:n]
     predicted = carried / np.maximum(contraction, NARROWEST**2) + fresh
     # A shifted prediction changes the log density of an observation by the shift times an innovation.
     shifts = (predicted / np.maximum(done.deviations, 1e-300)) ** 2 * (1.0 - contraction)
@@ -249,6 +250,23 @@ def _narrowing(cov: Array, before: Array) -> float:
     """Return the smallest ratio of the deviations of a state after and before the observation."""
     ratios = np.sqrt(np.maximum(np.diag(cov), 0.0)) / before
     return min(max(min((ratio for ratio in ratios.tolist() if ratio >= 0.0), default=1.0), NARROWEST), 1.0)
+
+
+def _known_part(shift: Array, cov: Array, spread: Array, size: float) -> Array:
+    """Return the part of a shift (n,) in directions in which so many particles say what becomes of it.
+
+    The regression on a direction in which particles have a share e of the variance has an error of 1 / (e sqrt(size)).
+
+    Args:
+        shift: of the mean.
+        cov: the covariance (n, n) of the particles.
+        spread: the variances (n,) of the states, of which linear ones have more than particles show.
+        size: effective number of the particles.
+    """
+    scale = np.sqrt(np.where(spread > 0, spread, 1.0))
+    shares, directions = np.linalg.eigh(cov / np.outer(scale, scale))
+    known = directions[:, shares * np.sqrt(size) > SURELY]
+    return np.asarray(scale * (known @ (known.T @ (shift / scale))))
 
 
 def _loss(variance: Array, cov: Array, count: int) -> float:

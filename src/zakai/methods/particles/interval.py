@@ -381,7 +381,8 @@ def _time_errors(
         x, gained = found.by(motion, stages)
         shift, largest = np.empty(system.n), np.empty(2)
         errors = StepErrors(
-            found.start, x, gained, found.finer, found.finer_gained, system.angles, pilots.scale, found.variances
+            found.start, x, gained, found.finer, found.finer_gained, system.angles, pilots.scale, found.variances,
+            system.owners,
         )
         step_errors(errors, LEAST_CONTRACTION, shift, largest)
         return 4 / 3 * float(largest[0]), 4 / 3 * shift, 4 / 3 * float(largest[1])

@@ -62,6 +62,8 @@ class System:
             place = model.state.index(name)
             self.box[0][place], self.box[1][place] = interval.lower, interval.upper
         self.angles = np.array([name in model.periodic for name in model.state])
+        # The coordinates by which each one contracts, and the row of the variance that particles carry: see `StepErrors`.
+        self.owners = np.column_stack([np.arange(n), np.full((n, 2), -1)])
         self.affine = self.kind == ADDITIVE and _is_affine(model)
         self.driven = bool(model.drift.free_symbols & {model.t, *model.u})  # whether f depends on time
         self.timed = bool(model.inputs) or any(
