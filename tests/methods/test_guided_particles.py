@@ -573,3 +573,15 @@ def test_mass_beyond_a_table_is_warned_of():
     result = zakai.filter(model, zakai.Record([0.5, 1.0, 2.0], [3.3, 3.0, 3.0], "samples"), PARTICLES, particles=2000)
     assert result.health["outside_tables"][1] < 1e-3 < 0.9 < result.health["outside_tables"][3]
     assert "outside_tables" in " ".join(result.warnings)
+
+
+def test_a_prior_on_a_domain_is_drawn_where_its_density_does_not_vanish_at_the_ends():
+    ends = {"a": {"lower": 0}, "b": {"lower": 0}, "c": {"lower": 1, "upper": 3}}
+    model = zakai.Model(
+        state=["a", "b", "c"], drift=["0", "0", "0"], diffusion=[["a", "0", "0"], ["0", "b", "0"], ["0", "0", "(c - 1)*(3 - c)"]],
+        observation=["a + b + c"], observation_kind="samples", observation_noise=[[1.0]], domain=ends,
+        prior={"kind": "density", "log_density": "log(a) - a - b"},
+    )  # fmt: skip
+    result = zakai.filter(model, zakai.Record([0.1], [[np.nan]], "samples"), PARTICLES, particles=40_000)
+    assert result.mean[0] == pytest.approx([2.0, 1.0, 2.0], rel=0.03)
+    assert result.variance[0] == pytest.approx([2.0, 1.0, 1 / 3], rel=0.06)

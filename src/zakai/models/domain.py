@@ -58,6 +58,15 @@ class Interval(NamedTuple):
             return self.lower + np.abs(x - self.lower)
         return self.upper - np.abs(self.upper - x)
 
+    def from_line(self, y: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the states inside that numbers y of the line stand for, by a logarithm at each finite end, and log dx/dy."""
+        if self.bounded:
+            width, share = self.upper - self.lower, -np.logaddexp(0.0, -y)
+            return self.lower + width * np.exp(share), np.log(width) + share - np.logaddexp(0.0, y)
+        if math.isfinite(self.lower):
+            return self.lower + np.exp(y), y
+        return (self.upper - np.exp(y), y) if math.isfinite(self.upper) else (y, np.zeros_like(y))
+
     def keys(self) -> dict[str, Any]:
         """Return the interval as the keys of a model file."""
         ends = {"lower": self.lower, "upper": self.upper}

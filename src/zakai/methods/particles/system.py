@@ -16,16 +16,19 @@ from typing import Any, NamedTuple
 import numpy as np
 import sympy as sp
 
+from zakai.densities import GridDensity
 from zakai.methods.particles.law import Law, Numbers
 from zakai.methods.particles.programs import Array, Expressions
 from zakai.methods.system.outside_tables import OutsideTables
-from zakai.methods.system.prior_moments import density_grid, prior_moments
+from zakai.methods.system.prior_moments import prior_moments
+from zakai.models.domain import Interval
 from zakai.models.kept import kept
 from zakai.models.model import Model
 from zakai.models.numeric import numpy_function
 from zakai.models.prior import DensityPrior, GaussianPrior, MixturePrior
 from zakai.numerics.particles.motion import ADDITIVE, COMMUTING, ORDERED
 from zakai.numerics.particles.noise import write_roots
+from zakai.numerics.prior_grid import prior_grid
 
 _MOST_ENTRIES = 400  # of the Jacobian of a drift that is checked for being affine
 
@@ -187,11 +190,21 @@ class System:
         assert isinstance(prior, DensityPrior)
         if model.n > 4:
             prior_moments(model, prior, theta)  # which says what to do
-        from zakai.densities import GridDensity
+        formula, ends = numpy_function(prior.log_density, model), [model.domain.get(name, Interval()) for name in model.state]
 
-        grid = density_grid(model, prior, theta, 1e-9)
+        def from_line(y: Array) -> tuple[Array, Array]:
+            """States (J, n) inside of the domain for numbers of the line, where no end cuts a density, and log dx/dy (J,)."""
+            x, slopes = zip(*(end.from_line(part) for end, part in zip(ends, y.T, strict=True)), strict=True)
+            return np.column_stack(x), np.sum(slopes, axis=0)
+
+        def log_density(y: Array) -> Array:
+            x, slope = from_line(y)
+            return np.asarray(formula(x, model.start, theta) + slope)
+
+        periodic, source = [name in model.periodic for name in model.state], f"{model.source}: prior: log_density"
+        grid = prior_grid(log_density, model.n, periodic, tolerance=1e-9, source=source)
         density = GridDensity(grid.log_values, grid.centre, grid.basis, model.state, (False,) * model.n)
-        return np.ascontiguousarray(density.sample(rng, count).T)
+        return np.ascontiguousarray(from_line(density.sample(rng, count))[0].T)
 
 
 def _along(function: sp.Expr, field: sp.Matrix, x: tuple[sp.Symbol, ...]) -> sp.Expr:
