@@ -21,9 +21,6 @@ _ENDS = (
     "in two or more states the density must vanish before the ends of the domain, and have a value beyond them; take the "
     "logarithm of a positive state as the state, or guided-particles"
 )
-_ENDS_OF_PARTICLES = (
-    "in two or more states the density must vanish at the ends of the domain; take the logarithm of a positive state as the state"
-)
 KEPT = 8  # schedules whose preparation is kept for each model
 
 
@@ -80,7 +77,8 @@ class Setting(NamedTuple):
 
     @property
     def _ends(self) -> str:
-        return _ENDS_OF_PARTICLES if self.method.name == "guided-particles" else _ENDS
+        """What to do where ends of a domain cut a prior, nothing where the method takes it."""
+        return "" if self.method.name == "guided-particles" else f"; {_ENDS}"
 
     @one_thread
     def begin(self) -> tuple[Prepared, State]:
@@ -92,7 +90,7 @@ class Setting(NamedTuple):
         except InputError as error:
             words = str(error)
             words = f"{self.model.source}: {words}" if words.startswith("prior") else words
-            error.args = (f"{words}; {self._ends}" if inside else words,)
+            error.args = (f"{words}{self._ends}" if inside else words,)
             raise
         if inside:
             self._check_domain(self.method.density(prepared, state))
@@ -104,4 +102,4 @@ class Setting(NamedTuple):
             low, high = density.marginal(name).quantile([NEGLIGIBLE, 1 - NEGLIGIBLE]).ravel()
             if low < interval.lower or high > interval.upper:
                 where = f"has mass outside of the domain of {name!r}, {interval}"
-                raise InputError(f"{self.model.source}: prior: {where}; {self._ends}")
+                raise InputError(f"{self.model.source}: prior: {where}{self._ends}")
