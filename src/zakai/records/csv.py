@@ -44,7 +44,7 @@ def read_record(
     observed". The text is UTF-8; a byte-order mark, Windows line ends and blank lines are accepted.
 
     Cells may be separated by semicolons or tabs, with decimal commas. Lines that begin with `#` are comments, `NA`, `null` and
-    the like are "not observed", `Time` and `t` are `time`, and a column of row numbers before it is left out.
+    the like are "not observed", `Time`, `t` and `date` are `time`, and a column of row numbers before it is left out.
 
     Columns with the names of the model's inputs, in addition to the m observations, are the inputs at these times; the first
     row with inputs holds from the model's start, and a row with empty inputs changes nothing.

@@ -161,6 +161,8 @@ def read_times(values: Any, unit: Any, origin: Any, what: str = "record") -> tup
         raise InputError(f"{what}: times are dates; give the unit of the model's time, as in unit='h'")
     if dates.ndim != 1 or not dates.size:
         return np.zeros(dates.shape), None, None
+    if origin is None and np.isnat(dates[0]):
+        raise InputError(f"{what}: the first row has no time; drop it, or give the date at which t = 0 as origin")
     clock = Clock.of(dates[0] if origin is None else origin, unit, what)
     return clock.times(dates), clock, dates
 

@@ -196,7 +196,8 @@ def check_inputs(model: Model, inputs: Any, first: float, last: float) -> None:
     if inputs is None and model.inputs:
         raise InputError(
             f"inputs: {', '.join(model.inputs)} of {model.source} are missing; give inputs=zakai.Inputs(times, values), "
-            "--inputs FILE.csv, or columns of the record with their names"
+            "--inputs FILE.csv, or columns of the CSV with their names; of a DataFrame, "
+            f"zakai.Record.from_pandas(frame, inputs={list(model.inputs)})"
         )
     if inputs is not None:
         inputs.check(model, first, last)

@@ -196,7 +196,7 @@ class Record:
         columns: Sequence[str] | None = None,
         inputs: Sequence[str] = (),
     ) -> Record:
-        """Return a record from a DataFrame: its column `time`, `Time` or `t`, else its index, and the other columns as values.
+        """Return a record from a DataFrame: its column `time`, `t` or `date`, else its index, and the other columns as values.
 
         Args:
             frame: a pandas DataFrame of K rows; missing values are not-observed.
@@ -242,6 +242,8 @@ class Record:
         read = [_column(rest.iloc[:, i], f"column {rest.columns[i]!r}") for i in range(rest.shape[1])]
         values = np.column_stack(read) if read else np.empty((len(frame), 0))
         dated = times.dtype.kind in "mM"
+        if dated:
+            read_times(times.to_numpy(), unit, origin, "Record.from_pandas")
         when = times if dated else _column(times, "time")
         given = Inputs.of_rows(times.to_numpy() if dated else when, np.column_stack(known), unit, origin) if known else None
         names = None if columns is not None else list(rest.columns)
@@ -385,8 +387,8 @@ def _check_numbers(frame: Any) -> None:
                 return
             wanted = ", ".join(map(repr, numbers))
             raise InputError(
-                f"Record.from_pandas: column {name!r} holds no numbers; name the columns of the observations, as in "
-                f"columns=[{wanted}]"
+                f"Record.from_pandas: column {name!r} holds no numbers; make them by pandas.to_numeric, or name the "
+                f"columns of the observations, as in columns=[{wanted}]"
             ) from None
 
 
