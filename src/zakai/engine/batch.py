@@ -23,6 +23,7 @@ OFF = 3.0  # times the announced seconds after which the rest is announced again
 MINUTE = 60.0  # seconds from which a method that is expected to be faster is named
 WATCHED = 1.0  # seconds between checks whether a run takes longer than was announced
 SURE = 0.5  # seconds after which the rest can be estimated
+AS_THIS = "take, if each is as long as the present one,"  # which has not ended
 
 _LOG = logging.getLogger("zakai")
 
@@ -132,11 +133,9 @@ class _Watch:
                 return  # how many of a compiled segment are done is not known
             rate = spent / max(count - before, 1)
             self.slow, self.seen, self.late = 2, (now, count), now + max(OFF * rate * left, OFF * spent)
-            about, name = "about" if count > before else "at least about", run.setting.method.name
+            take, name = "take about" if count > before else AS_THIS, run.setting.method.name
             advice = _advice(run, rate, rate * left)
-            _LOG.warning(
-                "%s: %d more observations take %s %.0f s; %s", name, round(left / self.blocks), about, rate * left, advice
-            )
+            _LOG.warning("%s: %d more observations %s %.0f s; %s", name, round(left / self.blocks), take, rate * left, advice)
 
     def _announce(self, run: Run, began: float, long: float, finished: Event) -> None:
         """Log that runs take longer than `long` seconds, if they seem to."""
@@ -155,8 +154,8 @@ class _Watch:
             left, more = rate * (self.total - count), round((self.total - count) / self.blocks)
             if now - began + left > long:
                 self.slow, self.late = 2, now + OFF * left
-                about = "about" if count > 1 else "at least about"
-                _LOG.warning("%s: %d more observations take %s %.0f s; %s", name, more, about, left, _advice(run, rate, left))
+                take = "take about" if count > 1 else AS_THIS
+                _LOG.warning("%s: %d more observations %s %.0f s; %s", name, more, take, left, _advice(run, rate, left))
 
     def report(self, run: Run, count: int) -> None:
         """Add intervals that a run has done; log once that the rest takes long, with what shortens it."""
