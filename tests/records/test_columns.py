@@ -196,3 +196,10 @@ def test_a_frame_with_a_column_of_text_asks_for_the_columns_of_the_observations(
     with pytest.raises(InputError, match=r"column 'status' holds no numbers; .* as in columns=\['temp', 'volt'\]"):
         zakai.Record.from_pandas(frame, "samples", inputs=["P"])
     assert zakai.Record.from_pandas(frame, "samples", columns=["temp"], inputs=["P"]).values.shape == (2, 1)
+
+
+def test_a_file_without_the_column_of_an_input_says_which(tmp_path):
+    keys = {"state": ["x"], "drift": ["T - x"], "observation": ["x"], "observation_kind": "samples", "inputs": ["T"]}
+    (tmp_path / "record.csv").write_text("date,y1,heater\n2026-01-01,0.1,1\n2026-01-02,0.2,1\n")
+    with pytest.raises(InputError, match="there is no column for the input T"):
+        zakai.read_record(tmp_path / "record.csv", zakai.Model(**keys), unit="d")

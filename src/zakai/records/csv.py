@@ -73,7 +73,12 @@ def read_record(
         read_table(path, model.m, "observations", dates=dates)
     observed = getattr(model, "observation_names", default_names(model.m))
     with named(f"{shown(path)}: row 1"):
-        places, note = observed_columns(names[1:], observed, model.inputs, columns)
+        try:
+            places, note = observed_columns(names[1:], observed, model.inputs, columns)
+        except InputError as error:
+            missing = [name for name in model.inputs if name not in names]
+            error.args = (f"{error}; there is no column for the input {', '.join(missing)}" if missing else str(error),)
+            raise
         known = _input_columns(names, model)
     used = [0, *(place + 1 for place in places), *known]
     equal = model.observation_kind == "samples" or not getattr(model, "kind_given", True)
