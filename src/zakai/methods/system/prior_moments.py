@@ -37,7 +37,8 @@ def prior_moments(model: Model, prior: Any, theta: np.ndarray) -> tuple[np.ndarr
         mixture = GaussianMixture(prior.weights, prior.means, prior.covs, model.state, tuple(periodic.tolist()))
         return mixture.mean(), mixture.cov()
     if model.n > _MOST_STATES:
-        raise InputError(f"{model.source}: prior: a density in {model.n} coordinates has no grid; give a gaussian")
+        what = f"a density in {model.n} coordinates has no grid; give a gaussian, wide where an angle is not known"
+        raise InputError(f"{model.source}: prior: {what}")
     grid = density_grid(model, prior, theta)
     if periodic.any():
         # Wrapped deviations jump half a turn away from the mean, and need more points than the density.
