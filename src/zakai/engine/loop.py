@@ -204,6 +204,12 @@ class Run:
         first = self.setting.method.density(self.empty, self.first)
         return first.mean(), first.cov()
 
+    @property
+    def kept_states(self) -> Sequence[State] | None:
+        """The states at the start and after every interval, None where they were not kept with all that a step needs."""
+        whole = self.setting.method.reduced is None and len(self.states) == len(self.schedule) + 1
+        return self.states if whole else None
+
     def density(self, index: int) -> Density:
         """Return the density at an index of the result."""
         return self.setting.method.density(self.empty, self.states[index])
