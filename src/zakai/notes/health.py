@@ -216,7 +216,8 @@ def _of_tolerance(
         when = f"from {start} on" if last + 1 == end else f"at {start}" if last == off[0] else f"from {start} to {stop}"
         if largest <= SLIGHT and not len(unknown):
             wanted = "" if asked is None else f"; asked: {asked:.1g}"
-            return [f"the means may be off by about {largest:.1g} standard deviations, {when}{wanted} (tolerance_ratio: {ratio:.2g})"]
+            size = f"{largest:.1g} standard deviations, {when}"
+            return [f"the means may be off by about {size}{wanted} (tolerance_ratio: {ratio:.2g})"]
         size = f"{largest:.1g} deviations, {when}"
         change = advice if largest > (OF_PARTICLES if len(result.state) >= MANY else VISIBLE) else _MORE_OBSERVATIONS
         said.append(f"the means may be off by about {size} {figure}; {change}")
