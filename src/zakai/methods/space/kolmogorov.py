@@ -13,14 +13,16 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from zakai.densities import Density, GridDensity, LogarithmicDensity
 from zakai.errors import InputError
 from zakai.methods._options import tolerance_of
 from zakai.methods._protocol import Info
 from zakai.methods.space.cross import CrossSystem, potential_of
 from zakai.methods.space.filter import State
+from zakai.methods.space.logarithms import is_formula, mass_outside, prior_of_logarithms, with_logarithms
 from zakai.methods.space.observed import MOST_PANELS, Observations
 from zakai.methods.space.short import predicted_on
-from zakai.methods.space.system import System, grid_of, moments_of, prior_on_grid, system_of, valid_noise
+from zakai.methods.space.system import System, grid_of, moments_of, moments_of_exponentials, prior_on_grid, system_of, valid_noise
 from zakai.methods.system.escape_of_states import check_escape
 from zakai.methods.system.notes import OMITTED
 from zakai.models.features import CROSS_NOISE
@@ -48,6 +50,7 @@ SHARE = 0.2  # of the tolerance, for the error in time of one interval
 LOST = 0.5  # error of a density relative to itself
 KEPT = 0.98  # largest share of an error that an interval is taken to leave
 OF_FIELDS = 3.0  # work where the noise depends on the state, in that of others (measured: 2 to 9)
+MOST_OUTSIDE = 0.05  # of the tolerance: mass of a prior where a logarithm has no value
 WIDER = 1.1  # growth of the deviations after which the error of a substep is measured again
 
 
@@ -63,7 +66,8 @@ class Prepared:
     """A model, a schedule and parameters, with the bounds that follow from the tolerance.
 
     `lie` tells whether the filter splits an interval at its end only, which has no backward pass.  An interval that needs more
-    than `most_work`, in grid points, raises ExhaustedError.
+    than `most_work`, in grid points, raises ExhaustedError.  With `logarithms` (n,) the model is that of the logarithms of some
+    states; `mapped` is what is prepared for that model, for a prior in which these states are positive.
     """
 
     model: Model
@@ -77,11 +81,26 @@ class Prepared:
     motions: dict[Any, Any] = field(default_factory=dict)
     lie: bool = False
     most_work: float = math.inf
+    logarithms: tuple[bool, ...] = ()
+    mapped: Prepared | None = None
+
+    def of(self, state: State) -> Prepared:
+        """Return what is prepared for the coordinates of a state."""
+        return self.mapped if state.logarithmic and self.mapped is not None else self
 
     def init(self, prior: Any) -> State:
         """Return the prior on a grid."""
-        tolerance = min(self.bounds.edge, self.bounds.tail)
-        found = prior_on_grid(self.model, prior, self.theta, tolerance, self.bounds.periodic)
+        tolerance, theta = min(self.bounds.edge, self.bounds.tail), self.theta
+        if self.mapped is not None:
+            known = prior_on_grid(self.model, prior, theta, tolerance, self.bounds.periodic) if is_formula(prior) else None
+            outside = mass_outside(prior, self.mapped.logarithms, known)
+            if outside < MOST_OUTSIDE * self.tolerance:
+                found = self.mapped.init(prior)
+                return found._replace(error=found.error + self.bounds.reach**2 * outside)
+        if self.logarithms:
+            found = prior_of_logarithms(self.model, prior, theta, tolerance, self.bounds.periodic, self.logarithms)
+        else:
+            found = prior_on_grid(self.model, prior, theta, tolerance, self.bounds.periodic)
         values = np.exp(found.log_values - np.max(found.log_values.real))
         error = found.error if found.error > 1e-6 else 0.0
         grid = Grid(found.centre, found.basis, values.shape, found.closed)
@@ -94,7 +113,8 @@ class Prepared:
 
     def bounded(self, points: float) -> Prepared:
         """Return the same with a bound on the work in an interval."""
-        return replace(self, most_work=points)
+        mapped = None if self.mapped is None else self.mapped.bounded(points)
+        return replace(self, most_work=points, mapped=mapped)
 
     @property
     def correlated(self) -> bool:
@@ -109,6 +129,19 @@ class Prepared:
     def density(self, state: State) -> Field:
         """Return the posterior on a grid."""
         return Field(state.values, grid_of(state, self.bounds.periodic), 0.0)
+
+    def posterior(self, field: Field) -> Density:
+        """Return a density on a grid as one of the states."""
+        with np.errstate(divide="ignore"):
+            logs = np.log(np.maximum(field.values.real, 0.0))
+        found = GridDensity(logs, field.grid.centre, field.grid.basis, self.model.state, self.angles)
+        return LogarithmicDensity(found, self.logarithms) if self.logarithms else found
+
+    def moments(self, field: Field) -> tuple[Array, Array, float]:
+        """Return the mean (n,) and covariance (n, n) of the states, and how much of a second moment may be off the grid."""
+        if not self.logarithms:
+            return *moments_of(field.values.real, field.grid, self.angles, field.survey(self.bounds)), 0.0
+        return moments_of_exponentials(field, self.angles, self.logarithms)
 
     def check_escape(self, k: int, state: State) -> None:
         """Raise InputError where paths escape from a density in interval k."""
@@ -235,13 +268,17 @@ class Prepared:
     ) -> tuple[State, Info]:
         result = positive(update.field, self.bounds) if found is None else update.field
         mean, cov = moments_of(result.values.real, result.grid, self.angles, found or result.survey(self.bounds))
+        deviations = np.sqrt(np.maximum(cov.diagonal(), 0.0))
         mass = result.values.sum() * result.grid.cell
         gained = np.log(mass) + (result.log_scale + constant)
         if not report.splitting + report.of_grid(self.bounds.reach) < LOST and np.isfinite(update.depth):
             result, mass = self._gaussian(result, mean, cov), 1.0
+        cut = 0.0
+        if self.logarithms:
+            mean, cov, cut = self.moments(result)
         edge, tails = max(report.edges, update.edges), max(report.tails, update.tails)
         made = (report.splitting + report.interpolation) * update.growth + update.interpolation + min(update.cut, 1.0)
-        made = made + 1e-15 * np.exp(min(update.depth, 40.0)) + self.bounds.reach**2 * edge * 0.1 + tails
+        made = made + 1e-15 * np.exp(min(update.depth, 40.0)) + self.bounds.reach**2 * max(edge, cut) * 0.1 + tails
         made = made + math.hypot(report.removed, update.removed, 0.0 if found is not None else result.removed)
         left = kept * state.error
         error = float(np.sqrt(left**2 + 2 * ALIKE * left * made + made**2))
@@ -257,7 +294,6 @@ class Prepared:
             "std_in_spacings": math.sqrt(-2 * math.log(min(max(tails, 1e-15), 0.9))) / math.pi,
         }
         # The error of a substep grows steeply with the deviations.
-        deviations = np.sqrt(np.maximum(cov.diagonal(), 0.0))
         measured = deviations if control.age == 0 else state.deviations
         if any(not new / WIDER <= old <= WIDER**3 * new for new, old in zip(deviations.tolist(), measured.tolist(), strict=True)):
             control = control._replace(age=CHECKED)
@@ -281,7 +317,7 @@ class Prepared:
     def _state(self, found: Field, mass: Any, control: Control, deviations: Array, error: float, kept: float) -> State:
         return State(
             found.values / mass, found.grid.centre, found.grid.basis, float(control.rate), float(control.measured),
-            int(control.age), control.fixed, deviations, float(error), float(kept),
+            int(control.age), control.fixed, deviations, float(error), float(kept), bool(self.logarithms),
         )  # fmt: skip
 
     def _kept(self, begin: Field, predicted: Field, result: Field) -> float:
@@ -302,14 +338,22 @@ def prepare(model: Model, schedule: Schedule, theta: np.ndarray, *, tolerance: f
         tolerance: bound on the relative error of the density; 1e-3 by default.
     """
     tolerance = tolerance_of(tolerance, DEFAULT_TOLERANCE)
-    n = model.n
-    if n > 4:
-        raise InputError(f"{model.source}: a density grid is for at most four states, and there are {n}")
+    if model.n > 4:
+        raise InputError(f"{model.source}: a density grid is for at most four states, and there are {model.n}")
+    prepared = _prepared(model, schedule, np.asarray(theta), tolerance)
+    found = with_logarithms(model)
+    if found is None:
+        return prepared
+    mapped = _prepared(found[0], schedule, np.asarray(theta), tolerance)
+    return replace(prepared, mapped=replace(mapped, logarithms=found[1]))
+
+
+def _prepared(model: Model, schedule: Schedule, theta: np.ndarray, tolerance: float) -> Prepared:
     periodic = tuple(name in model.periodic for name in model.state)
     tail = min(tolerance**2, 1e-3 * tolerance)
     finer = max(spline_error(tail) / (OF_SPLINES * tolerance), 1.0) ** (1 / 6)
-    bounds = Bounds(1e-3 * tolerance, tail, MOST[n], periodic, finer=finer)
-    system, theta = system_of(model), np.asarray(theta)
+    bounds = Bounds(1e-3 * tolerance, tail, MOST[model.n], periodic, finer=finer)
+    system = system_of(model)
     tables, motions = ({}, {}) if is_complex(theta) else system.caches(theta)
     observations = Observations(model, schedule, system, theta, tables)
     gathered = CROSS_NOISE in model.features and bool((schedule.seen & ~schedule.inside).any())

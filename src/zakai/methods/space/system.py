@@ -20,6 +20,7 @@ from zakai.models.numeric import numpy_function
 from zakai.models.prior import DensityPrior
 from zakai.numerics.prior_grid import PriorGrid, mixture_grid, prior_grid
 from zakai.numerics.space.average import average
+from zakai.numerics.space.field import Field
 from zakai.numerics.space.grid import Grid, weighted_products
 from zakai.numerics.space.survey import Survey, survey
 from zakai.numerics.space.transport import Dynamics
@@ -173,3 +174,24 @@ def moments_of(values: Array, grid: Grid, periodic: tuple[bool, ...], found: Sur
     apart = np.where(angle, apart - 2 * np.pi * np.round(apart / (2 * np.pi)), apart)
     where = grid.centre + mean
     return np.where(angle, np.pi - np.mod(np.pi - where, 2 * np.pi), where), weighted_products(weights, apart)
+
+
+def moments_of_exponentials(
+    field: Field, periodic: tuple[bool, ...], logarithms: tuple[bool, ...]
+) -> tuple[Array, Array, float]:
+    """Return the mean (n,) and covariance (n, n) of x, x_i = e^(w_i) for `logarithms`, from a real density of w on a grid.
+
+    The third is the largest value at the edges of the grid of the marginals of x_i^2 times the density, relative to their maxima.
+    """
+    grid, chosen = field.grid, np.flatnonzero(logarithms)
+    mean, cov = moments_of(field.values.real, grid, periodic)
+    weights, points = field.values.real.reshape(-1) / field.values.real.sum(), grid.points
+    x = np.exp(points[:, chosen])
+    apart = points - mean
+    apart = np.where(periodic, apart - 2 * np.pi * np.round(apart / (2 * np.pi)), apart)
+    mean, edges = mean.copy(), []
+    for d, column in zip(chosen, x.T, strict=True):
+        mean[d] = weights @ column
+        apart[:, d] = column - mean[d]
+        edges.append(survey((weights * (column / mean[d]) ** 2).reshape(grid.sizes), grid, 0.0).edges.max())
+    return mean, weighted_products(weights, apart), float(max(edges))
