@@ -14,8 +14,8 @@ def growth(**keys):
     """Geometric Brownian motions with correlated noise, seen with log-normal noise: the logarithms are linear and Gaussian."""
     parts = {
         "state": ["x", "y"], "drift": ["0.2*x", "-0.1*y"], "diffusion": [["0.3*x", "0"], ["0.1*y", "0.2*y"]],
-        "observation": ["log(x)", "log(x*y)"], "observation_family": "log-normal", "observation_noise": [["0.02", "0"], ["0", "0.05"]],
-        "observation_kind": "samples", "prior": {"kind": "density", "log_density": LOG_PRIOR},
+        "observation": ["log(x)", "log(x*y)"], "observation_family": "log-normal", "observation_kind": "samples",
+        "observation_noise": [["0.02", "0"], ["0", "0.05"]], "prior": {"kind": "density", "log_density": LOG_PRIOR},
         "domain": {"x": {"lower": 0.0}, "y": {"lower": 0.0}},
     }  # fmt: skip
     return zakai.Model(**{**parts, **keys})
@@ -120,7 +120,11 @@ def test_a_density_is_saved_and_the_prior_of_a_next_record(tmp_path):
     model = predator_prey()
     result = zakai.filter(model, zakai.Record([0.5], [[7.0, 6.0]], "samples"), "yau-yau")
     result.density(1).save(tmp_path / "density")
-    later = model.with_prior(zakai.load_density(tmp_path / "density"), start=0.5)
+    loaded = zakai.load_density(tmp_path / "density")
+    assert np.array_equal(loaded.points, result.density(1).points)
+    later = model.with_prior(loaded, start=0.5)
+    (tmp_path / "later.toml").write_text(later.text)
+    later = zakai.load_model(tmp_path / "later.toml")
     again = zakai.filter(later, zakai.Record([1.0], [[5.0, 7.0]], "samples"), "yau-yau")
     whole = zakai.filter(model, zakai.Record([0.5, 1.0], [[7.0, 6.0], [5.0, 7.0]], "samples"), "yau-yau")
     assert np.abs((again.mean[1] - whole.mean[2]) / np.sqrt(whole.variance[2])).max() < 1e-3

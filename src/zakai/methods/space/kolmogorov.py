@@ -28,7 +28,7 @@ from zakai.methods.system.notes import OMITTED
 from zakai.models.features import CROSS_NOISE
 from zakai.models.model import Model
 from zakai.numerics.complex_step import is_complex
-from zakai.numerics.prior_grid import mixture_grid
+from zakai.numerics.prior_grid import PriorGrid, mixture_grid
 from zakai.numerics.space.advance import CHECKED, Control, advance
 from zakai.numerics.space.field import NOTHING, Field, Report, positive, spline_error
 from zakai.numerics.space.grid import Grid
@@ -89,20 +89,22 @@ class Prepared:
         return self.mapped if state.logarithmic and self.mapped is not None else self
 
     def init(self, prior: Any) -> State:
-        """Return the prior on a grid."""
-        tolerance, theta = min(self.bounds.edge, self.bounds.tail), self.theta
-        if self.mapped is not None:
-            known = prior_on_grid(self.model, prior, theta, tolerance, self.bounds.periodic) if is_formula(prior) else None
-            outside = mass_outside(prior, self.mapped.logarithms, known)
+        """Return the prior on a grid, of logarithms where these states are positive."""
+        tolerance, mapped = min(self.bounds.edge, self.bounds.tail), self.mapped
+        known = None
+        if mapped is None or is_formula(prior):
+            known = prior_on_grid(self.model, prior, self.theta, tolerance, self.bounds.periodic)
+        if mapped is not None:
+            outside = mass_outside(prior, mapped.logarithms, known)
             if outside < MOST_OUTSIDE * self.tolerance:
-                found = self.mapped.init(prior)
-                return found._replace(error=found.error + self.bounds.reach**2 * outside)
-        if self.logarithms:
-            found = prior_of_logarithms(self.model, prior, theta, tolerance, self.bounds.periodic, self.logarithms)
-        else:
-            found = prior_on_grid(self.model, prior, theta, tolerance, self.bounds.periodic)
+                of_w = mapped.model, prior, self.theta, tolerance, self.bounds.periodic, mapped.logarithms, known
+                return mapped.began(prior_of_logarithms(*of_w), self.bounds.reach**2 * outside)
+        return self.began(known or prior_on_grid(self.model, prior, self.theta, tolerance, self.bounds.periodic), 0.0)
+
+    def began(self, found: PriorGrid, error: float) -> State:
+        """Return the state of a prior on a grid, with an error that it has already."""
         values = np.exp(found.log_values - np.max(found.log_values.real))
-        error = found.error if found.error > 1e-6 else 0.0
+        error += found.error if found.error > 1e-6 else 0.0
         grid = Grid(found.centre, found.basis, values.shape, found.closed)
         return self.started(positive(Field(values, grid, 0.0), self.bounds), error)
 

@@ -20,6 +20,7 @@ from zakai.models.prior import DensityPrior
 from zakai.numerics.prior_grid import PriorGrid, prior_grid
 
 Array = Any
+NEAREST = 0.05  # of the mean: the least state of the first grid of a prior, which becomes wider where there is mass
 _NOT_OF_W = ("covariance", "features", "depends_on_time", "observation_law", "text", "_kept")  # computed from the formulas
 
 
@@ -87,27 +88,42 @@ def mass_outside(prior: Any, logarithms: tuple[bool, ...], found: PriorGrid | No
         weights = np.exp(found.log_values.real - found.log_values.real.max())
         outside = np.any((found.points <= 0) & np.array(logarithms), axis=-1)
         return float(weights[outside].sum() / weights.sum())
-    weights, means, covs = prior.components
-    deviations = np.sqrt(np.maximum(np.diagonal(covs, axis1=1, axis2=2), 1e-300))
+    weights, means, deviations = _components(prior)
     below = np.array([[math.erfc(z / math.sqrt(2)) / 2 for z in row] for row in (means / deviations).tolist()])
     return float(weights @ below[:, list(logarithms)].sum(axis=1))
 
 
 def prior_of_logarithms(
-    model: Model, prior: Any, theta: Array, tolerance: float, periodic: tuple[bool, ...], logarithms: tuple[bool, ...]
-) -> PriorGrid:
-    """Return the prior as a density of w on a grid, where it has its mass where states with logarithms are positive."""
-    if isinstance(prior, DensityPrior):
-        function = numpy_function([prior.log_density], model, ())
+    model: Model, prior: Any, theta: Array, tolerance: float, periodic: tuple[bool, ...], logarithms: tuple[bool, ...],
+    found: PriorGrid | None,
+) -> PriorGrid:  # fmt: skip
+    """Return a prior, of a formula on the grid `found` of the states, as a density of w on a grid.
 
-        def log_density(x: Array) -> Array:
-            return function(x, model.start, theta)
+    Its mass is where the states with logarithms are positive.
+    """
+    if found is not None:
+        function = numpy_function([prior.log_density], model, ())
+        logs = found.log_values.real - found.log_values.real.max()
+        points = found.points[(logs > math.log(tolerance)) & np.all((found.points > 0) | ~np.array(logarithms), axis=-1)]
+        ends = points.min(axis=0), points.max(axis=0)
     else:
-        log_density = prior.log_density
+        _, means, deviations = _components(prior)
+        reach = math.sqrt(-2 * math.log(tolerance)) * deviations
+        nearest = np.where(logarithms, NEAREST * means, -np.inf)
+        ends = np.maximum(means - reach, nearest).min(axis=0), (means + reach).max(axis=0)
 
     def of_w(w: Array) -> Array:
         x = np.exp(w, where=logarithms, out=np.array(w, float))
-        return np.asarray(log_density(x)) + np.sum(w, axis=-1, where=logarithms)
+        logs = prior.log_density(x) if found is None else function(x, model.start, theta)
+        return np.asarray(logs) + np.sum(w, axis=-1, where=logarithms)
 
-    source = f"{model.source}: prior"
-    return prior_grid(of_w, model.n, periodic, tolerance=tolerance, aligned=any(periodic), source=source)
+    low, high = (np.log(end, where=logarithms, out=end.copy()) for end in ends)
+    return prior_grid(
+        of_w, model.n, periodic, tolerance=tolerance, aligned=any(periodic), source=f"{model.source}: prior", box=(low, high)
+    )
+
+
+def _components(prior: Any) -> tuple[Array, Array, Array]:
+    """Return the weights (k,), the means and the standard deviations (k, n) of a Gaussian or a mixture."""
+    weights, means, covs = prior.components
+    return weights, means, np.sqrt(np.maximum(np.diagonal(covs, axis1=1, axis2=2), 1e-300))
