@@ -32,6 +32,7 @@ from zakai.numerics.prior_grid import PriorGrid, mixture_grid
 from zakai.numerics.space.advance import CHECKED, Control, advance
 from zakai.numerics.space.field import NOTHING, Field, Report, positive, spline_error
 from zakai.numerics.space.grid import Grid
+from zakai.numerics.space.rough import checked, for_rough
 from zakai.numerics.space.step import Stepper
 from zakai.numerics.space.survey import Survey
 from zakai.numerics.space.update import Update, updated
@@ -181,7 +182,10 @@ class Prepared:
             update = Update(predicted, report.edges, report.tails, 0.0, False)
             if factor is not None:
                 wider = partial(observations.wider, begin, predicted, parts, self.bounds)
-                update = updated(predicted, factor, bounds, report.tails, wider=wider)
+                rough = self.system.rough
+                update = updated(predicted, factor, for_rough(bounds) if rough else bounds, report.tails, wider=wider)
+                if rough:
+                    update = checked(predicted, update, factor, bounds)
                 report = report._replace(interpolation=POINTWISE * report.interpolation)
             if before is not None and not report.splitting + report.of_grid(bounds.reach) < LOST:
                 (predicted, report, after, update), found = before, None

@@ -13,7 +13,7 @@ import sympy
 from zakai.methods.space.filter import State
 from zakai.methods.space.functions import PointFunction
 from zakai.models.features import OF_OBSERVATION, STATE_DEPENDENT_DIFFUSION
-from zakai.models.functions import TableFunction, without_jumps
+from zakai.models.functions import Floor, Maximum, Minimum, TableFunction, without_jumps
 from zakai.models.kept import once_for_a_model
 from zakai.models.model import Model
 from zakai.models.numeric import numpy_function
@@ -27,6 +27,7 @@ from zakai.numerics.space.transport import Dynamics
 from zakai.records.inputs import Inputs
 
 Array = Any
+_ROUGH: tuple[Any, ...] = (sympy.Abs, sympy.sign, Floor, Maximum, Minimum, TableFunction)
 Caches = tuple[dict[Any, Any], dict[Any, Any]]
 
 
@@ -52,6 +53,10 @@ class System:
         self.varies = self.varies or bool(model.u)
         # Whether samples have a law that is not N(h(x, t), S(t)).
         self.general = model.observation_kind == "samples" and bool(model.u or OF_OBSERVATION & model.features.keys())
+        # Whether the law of what is observed has kinks or jumps in the state.
+        parts = [*model.observation, *model.observation_noise, *model.family_parameters.values()]
+        calls = set().union(*(part.atoms(*_ROUGH) for part in [*parts, *([model.log_density] if model.log_density else [])]))
+        self.rough = any(call.has(*x) and not (isinstance(call, TableFunction) and call.table.degree > 1) for call in calls)
         self.tables = [(call.table, numpy_function(list(call.args), model, (len(call.args),))) for call in _table_calls(model)]
         self.state_dependent = STATE_DEPENDENT_DIFFUSION in model.features
         self._caches: dict[bytes, Caches] = {}

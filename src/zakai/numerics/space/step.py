@@ -25,9 +25,9 @@ from zakai.numerics.space.field import (
     positive,
     refinable,
 )
-from zakai.numerics.space.grid import Grid, filtered
+from zakai.numerics.space.grid import Grid, filtered, inverted
 from zakai.numerics.space.splitting import Move, Potential, Source, after_motion, before_motion
-from zakai.numerics.space.survey import deviations_in_spacings, narrowest, survey
+from zakai.numerics.space.survey import deviations_in_spacings, narrowest, smoothed, survey
 from zakai.numerics.space.transport import (
     Dynamics,
     Linearisation,
@@ -119,19 +119,25 @@ class Stepper:
         tolerance = 0.05 * self.tolerance * np.exp(-0.5 * logs)
         inverse, variances = grid.inverse, np.maximum(np.diagonal(found.cov), 1e-300)
         moves: list[Move] = []
-        noise, moved, steps = np.zeros_like(found.cov), np.zeros_like(start), 0
+        noise, moved, steps, through_all = np.zeros_like(found.cov), np.zeros_like(start), 0, np.eye(grid.n)
         for (a, b), linear in zip(pairwise(times), linears, strict=True):
             if not steps:
                 steps, moved = steps_needed(dynamics, grid.centre + start, a, b, inverse, tolerance)
             else:
                 with np.errstate(all="ignore"):
                     moved = moved + moved_points(dynamics, grid.centre + start + moved, a, b, steps)[:, : grid.n]
-            noise = linear.map.real @ noise @ linear.map.real.T + linear.noise.real
+            through_all = linear.map.real @ through_all
+            carried = linear.map.real @ noise @ linear.map.real.T
+            noise = carried + linear.noise.real
             good = np.isfinite(moved).all(axis=1)
             short = np.abs(moved[good] @ inverse.T).max(initial=0.0) < 1.5 and (np.diagonal(noise) / variances).max() < 0.2
             target = grid
             if not (short and holds) and good.any():
-                target = fitted_grid(Points((start + moved)[good], logs[good], grid.centre), noise, narrow, bounds, grid)
+                # The half of its noise that acts before the motion makes narrow parts wider before they are on the new grid.
+                through = inverse @ inverted(through_all)
+                before = through @ (carried + 0.5 * linear.noise.real) @ through.T
+                smooth = smoothed(narrow, found.conditional, before)
+                target = fitted_grid(Points((start + moved)[good], logs[good], grid.centre), noise, smooth, bounds, grid)
             moves.append(Move(linear, steps, target))
         return moves
 
