@@ -96,10 +96,10 @@ class Prepared:
         if mapped is None or is_formula(prior):
             known = prior_on_grid(self.model, prior, self.theta, tolerance, self.bounds.periodic)
         if mapped is not None:
-            outside = mass_outside(prior, mapped.logarithms, known)
+            outside, error = mass_outside(prior, mapped.logarithms, known)
             if outside < MOST_OUTSIDE * self.tolerance:
                 of_w = mapped.model, prior, self.theta, tolerance, self.bounds.periodic, mapped.logarithms, known
-                return mapped.began(prior_of_logarithms(*of_w), self.bounds.reach**2 * outside)
+                return mapped.began(prior_of_logarithms(*of_w), error)
         return self.began(known or prior_on_grid(self.model, prior, self.theta, tolerance, self.bounds.periodic), 0.0)
 
     def began(self, found: PriorGrid, error: float) -> State:

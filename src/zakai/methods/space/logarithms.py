@@ -21,6 +21,7 @@ from zakai.numerics.prior_grid import PriorGrid, prior_grid
 
 Array = Any
 NEAREST = 0.05  # of the mean: the least state of the first grid of a prior, which becomes wider where there is mass
+FAR_OUT = 15.0  # least squared deviations from the mean of the mass of a prior below zero
 _NOT_OF_W = ("covariance", "features", "depends_on_time", "observation_law", "text", "_kept")  # computed from the formulas
 
 
@@ -82,15 +83,23 @@ def is_formula(prior: Any) -> bool:
     return isinstance(prior, DensityPrior)
 
 
-def mass_outside(prior: Any, logarithms: tuple[bool, ...], found: PriorGrid | None) -> float:
-    """Return the mass of a prior, which may be given on a grid, where a state with a logarithm is not positive."""
+def mass_outside(prior: Any, logarithms: tuple[bool, ...], found: PriorGrid | None) -> tuple[float, float]:
+    """Return the mass of a prior where a state with a logarithm is not positive, and the error of moments without it.
+
+    The prior may be given on a grid.  The error of a variance, relative to it, is the mass times its squared distance.
+    """
+    chosen = np.flatnonzero(logarithms)
     if found is not None:
-        weights = np.exp(found.log_values.real - found.log_values.real.max())
-        outside = np.any((found.points <= 0) & np.array(logarithms), axis=-1)
-        return float(weights[outside].sum() / weights.sum())
-    weights, means, deviations = _components(prior)
-    below = np.array([[math.erfc(z / math.sqrt(2)) / 2 for z in row] for row in (means / deviations).tolist()])
-    return float(weights @ below[:, list(logarithms)].sum(axis=1))
+        weights = np.exp(found.log_values.real - found.log_values.real.max()).reshape(-1)
+        weights, points = weights / weights.sum(), found.points.reshape(-1, len(logarithms))[:, chosen]
+        mass, mean = float(weights[np.any(points <= 0, axis=1)].sum()), weights @ points
+        variances = weights @ (points - mean) ** 2
+    else:
+        weights, means, deviations = (part[..., chosen] if part.ndim > 1 else part for part in _components(prior))
+        below = np.array([[math.erfc(z / math.sqrt(2)) / 2 for z in row] for row in (means / deviations).tolist()])
+        mass, mean = float(weights @ below.sum(axis=1)), weights @ means
+        variances = weights @ (deviations**2 + (means - mean) ** 2)
+    return mass, mass * max(FAR_OUT, float(np.max(mean**2 / variances)))
 
 
 def prior_of_logarithms(
@@ -107,10 +116,10 @@ def prior_of_logarithms(
         points = found.points[(logs > math.log(tolerance)) & np.all((found.points > 0) | ~np.array(logarithms), axis=-1)]
         ends = points.min(axis=0), points.max(axis=0)
     else:
-        _, means, deviations = _components(prior)
+        weights, means, deviations = _components(prior)
         reach = math.sqrt(-2 * math.log(tolerance)) * deviations
-        nearest = np.where(logarithms, NEAREST * means, -np.inf)
-        ends = np.maximum(means - reach, nearest).min(axis=0), (means + reach).max(axis=0)
+        nearest = np.where(logarithms, NEAREST * (weights @ means), -np.inf)
+        ends = np.maximum((means - reach).min(axis=0), nearest), (means + reach).max(axis=0)
 
     def of_w(w: Array) -> Array:
         x = np.exp(w, where=logarithms, out=np.array(w, float))
