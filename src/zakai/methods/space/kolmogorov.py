@@ -256,7 +256,7 @@ class Prepared:
                 points = mean + np.concatenate([np.zeros((1, len(mean))), np.diag(np.sqrt(np.diagonal(cov)))])
                 least = max(fewest, observations.least(points, start, length, inside))
             most_work = self.most_work / (OF_FIELDS if observations.system.state_dependent else 1.0)
-            stepper = Stepper(observations.dynamics, bounds, self.tolerance, most_work)
+            stepper = Stepper(observations.dynamics, bounds, self.tolerance, most_work, self.system.rough)
             if steppers is not None:
                 steppers.append(stepper)
             result, more, control = advance(stepper, result, start, length, potential, control, allowed / len(parts), least)

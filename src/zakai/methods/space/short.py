@@ -60,8 +60,8 @@ def predicted_on(
     moved, removed = motion_of(prepared, grid, length), 0.0
     found = begin.survey(prepared.bounds)
     if length <= moved.longest and not fits(found, grid, prepared.bounds):
-        if found.tails.max() > ACCEPTED * prepared.bounds.tail:  # of kinks, which the noise makes smooth before another grid
-            return None
+        if prepared.system.rough and found.tails.max() > ACCEPTED * prepared.bounds.tail:
+            return None  # the noise makes kinks smooth before the density is on another grid
         begin = positive(refitted(begin, prepared.bounds), prepared.bounds)
         removed = begin.removed
         grid, moved = begin.grid, motion_of(prepared, begin.grid, length)

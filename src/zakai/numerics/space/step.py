@@ -62,10 +62,12 @@ class Stepper:
     """Substeps of one interval.
 
     `work` are the grid points at which a density was computed, and `SUBSTEP_WORK` for each computation; a Runge-Kutta step of a
-    point counts as `STEP_WORK` points.  Before it is more than `most_work` an ExhaustedError is raised.
+    point counts as `STEP_WORK` points.  Before it is more than `most_work` an ExhaustedError is raised.  Densities are `rough`
+    where a likelihood has kinks or jumps.
     """
 
-    def __init__(self, dynamics: Dynamics, bounds: Bounds, tolerance: float, most_work: float = math.inf):
+    def __init__(self, dynamics: Dynamics, bounds: Bounds, tolerance: float, most_work: float = math.inf, rough: bool = False):
+        self.rough = rough
         self.dynamics, self.bounds, self.tolerance, self.most_work, self.work = dynamics, bounds, tolerance, most_work, 0.0
         self.taken: list[tuple[Substep, ...]] = []  # single substeps, and the two halves of extrapolated ones
         self._linearised: tuple[Array, tuple[float, ...], list[Linearisation]] | None = None
@@ -136,7 +138,7 @@ class Stepper:
                 # The half of its noise that acts before the motion makes narrow parts wider before they are on the new grid.
                 through = inverse @ inverted(through_all)
                 before = through @ (carried + 0.5 * linear.noise.real) @ through.T
-                smooth = smoothed(narrow, found.conditional, before)
+                smooth = smoothed(narrow, found.conditional, before) if self.rough else narrow
                 target = fitted_grid(Points((start + moved)[good], logs[good], grid.centre), noise, smooth, bounds, grid)
             moves.append(Move(linear, steps, target))
         return moves
