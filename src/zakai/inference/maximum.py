@@ -308,17 +308,18 @@ def _maximum(
                 break
             information, deviations = np.zeros((0, 0)), np.sqrt(np.diag(cov))  # of the place where the search has ended
             continue
-        # Newton's step, in the box; where it gains nothing, rounding has been reached.
+        # Newton's step, in the box; where it gains nothing, rounding or the jumps have been reached.
         step = np.nan_to_num(cov) @ np.where(free, gradient, 0.0)
         for halvings in range(HALVINGS):
             trial = np.clip(u - 0.5**halvings * step, limits[:, 0], limits[:, 1])
             new, slope = objective.exact(trial)
             if np.isfinite(new) or objective.at_limit(u, gradient):
                 break
-        if not new <= value + 1e-13 * abs(value):
+        if not new <= value + max(1e-13 * abs(value), jumps):
             break
         value, u, gradient, iterations = new, trial, slope, iterations + 1
-    converged = bool(distance < NEAR) if np.isfinite(distance) else bool(search.success and not problem.startswith("the log"))
+    near = max(NEAR, float(np.sqrt(2.0 * jumps)))
+    converged = bool(distance < near) if np.isfinite(distance) else bool(search.success and not problem.startswith("the log"))
     if converged or u.any():  # Newton's steps have left the limit
         beyond = objective.beyond if not converged and objective.at_limit(u, gradient) else None
     problem = problem if beyond is None else ""
