@@ -158,3 +158,19 @@ def test_residuals_of_two_methods_agree_in_two_states(kind):
     _, record = zakai.simulate(model, 0.1 * np.arange(1, 6), seed=5)
     first, second = (zakai.filter(model, record, method).residuals() for method in ("general-direct", "yau-yau"))
     np.testing.assert_allclose(first, second, atol=3e-3)
+
+
+def test_the_record_is_not_filtered_again_where_densities_were_kept(monkeypatch):
+    model = zakai.Model(
+        state=["x", "y"], drift=["y", "x - x**3 - y"], diffusion=[["0.3", "0"], ["0", "0.5"]], observation=["x", "y + x**2"],
+        observation_noise=[["0.1", "0"], ["0", "0.2"]], observation_kind="samples",
+        prior={"kind": "gaussian", "mean": [0.0, 0.0], "cov": [0.3, 0.3]},
+    )  # fmt: skip
+    _, record = zakai.simulate(model, np.arange(1, 6) * 0.2, seed=3)
+    expected = zakai.filter(model, record, "yau-yau", keep="moments").residuals()
+
+    def filtered(*_, **__):
+        raise AssertionError("the record was filtered again")
+
+    monkeypatch.setattr("zakai.diagnostics.residuals.segments", filtered)
+    assert np.array_equal(zakai.filter(model, record, "yau-yau").residuals(), expected)

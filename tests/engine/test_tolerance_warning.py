@@ -8,7 +8,7 @@ from scipy import special
 
 import zakai
 from zakai import _progress
-from zakai.notes.health import warnings_of_run
+from zakai.notes.health import warnings_of_run, warnings_of_step
 
 
 def linear(**more):
@@ -20,6 +20,7 @@ def linear(**more):
     ("errors", "words"),
     [
         ([0, 5e-4, 9e-4, 2e-4], None),
+        ([0, 5e-4, 3e-3, 2e-4], "off by about 0.003 standard deviations, at t = 0.2 (tolerance_ratio: 7)"),
         ([0, 5e-4, 0.03, 0.2], "off by about 0.2 deviations, from t = 0.2 on"),
         ([0, 0.3, 2e-4, 2e-4], "off by about 0.3 deviations, at t = 0.1"),
         ([0, 0.3, 0.03, 2e-4], "off by about 0.3 deviations, from t = 0.1 to t = 0.2"),
@@ -32,12 +33,29 @@ def test_an_estimate_says_how_far_and_since_when(errors, words):
     result.health["error_estimate"] = np.array(errors)
     result.health["tolerance_ratio"] = np.array([np.nan, 7.0, 3.0, 2.0])
     found = warnings_of_run(result)
-    assert found == [] if words is None else len(found) == 1 and words in found[0] and "up to 7" in found[0]
+    assert found == [] if words is None else len(found) == 1 and words in found[0] and re.search(r"up to 7|ratio: 7", found[0])
     # A result of a coarser tolerance that agrees bounds the error too.
     assert warnings_of_run(result, distances=lambda: np.array([0, 1e-4, 1e-4, 1e-4])) == []
     if words is not None:
         (closer,) = warnings_of_run(result, distances=lambda: np.array([0, 0.02, 0.01, 0.01]))
-        assert "off by about 0.02 deviations" in closer or errors[1] < 1e-3
+        assert "off by about 0.02 standard deviations" in closer or errors[1] < 1e-3
+
+
+def test_a_slight_error_is_said_with_its_size_and_what_was_asked_without_advice():
+    model = zakai.Model(
+        state=["x", "v"], drift=["v", "2*(1 - x**2)*v - x"], diffusion=[["0"], ["0.3"]], observation=["x"],
+        observation_noise=[["0.02"]], observation_kind="samples",
+        prior={"kind": "gaussian", "mean": [1.5, 0.0], "cov": [0.05, 0.05]},
+    )  # fmt: skip
+    forecast = zakai.filter(model, zakai.Record([0.3], [np.nan], "samples"), "yau-yau").forecast([2.8, 5.3])
+    ratio, error = forecast.health["tolerance_ratio"][1:].max(), forecast.error_estimate[1:].max()
+    assert ratio > 1 and 1e-3 < error < 0.05
+    (said,) = forecast.warnings
+    assert said.startswith(f"the means may be off by about {error:.1g} standard deviations, ") and "asked: 0.001 (" in said
+    assert ";" not in said.replace("; asked", "")
+    figures = {"tolerance_ratio": 3.0, "error_estimate": 3e-3}
+    words = "the mean may be off by up to 0.003 standard deviations (tolerance_ratio is 3)"
+    assert warnings_of_step(figures, forecast.bounds, {}) == [words]
 
 
 def test_a_right_result_that_a_coarser_tolerance_reproduces_is_silent():

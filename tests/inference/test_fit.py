@@ -394,3 +394,25 @@ def test_filters_of_a_fit_are_not_announced_one_by_one(monkeypatch, caplog):
     caplog.clear()
     zakai.fit(model, record, method="guided-particles", particles=500)
     assert "more observations take" not in caplog.text
+
+
+def test_a_fit_on_grids_of_two_states_ends_where_their_accuracy_does(monkeypatch):
+    from zakai.engine.likelihood import LogLikelihood
+
+    model = zakai.Model(
+        state=["x", "v"], drift=["v", "x - x**3 - 0.3*v"], diffusion=[["0"], ["s"]], observation=["x"],
+        observation_noise=[["0.05"]], observation_kind="samples", parameters={"s": 0.5},
+        prior={"kind": "gaussian", "mean": [1.0, 0.0], "cov": [0.1, 0.1]},
+    )  # fmt: skip
+    _, record = zakai.simulate(model, np.arange(1, 21) * 0.25, seed=3)
+    likelihood, calls, evaluated = zakai.log_likelihood(model, record, "yau-yau"), [], LogLikelihood._evaluated
+
+    def counted(self, *given, **keys):
+        calls.append(keys)
+        return evaluated(self, *given, **keys)
+
+    monkeypatch.setattr(LogLikelihood, "_evaluated", counted)
+    fitted = zakai.fit(model, record, method="yau-yau", start={"s": 0.8})
+    assert fitted.converged and len(calls) <= 12 and all(keys == {"own": False} for keys in calls)
+    _, gradient = likelihood.value_and_gradient(list(fitted.estimates.values()))
+    assert np.sqrt(gradient @ fitted.covariance @ gradient) < 0.02  # standard errors from the maximum

@@ -5,6 +5,7 @@ from zakai.densities.conditional import ConditionalParticleDensity
 from zakai.densities.gaussian import GaussianMixture
 from zakai.densities.grid import GridDensity
 from zakai.densities.interval import IntervalDensity
+from zakai.densities.logarithmic import LogarithmicDensity
 from zakai.densities.mapped import MappedDensity
 from zakai.densities.particles import ParticleDensity
 from zakai.densities.points import PointMasses
@@ -12,6 +13,6 @@ from zakai.densities.product import ProductDensity
 from zakai.densities.tensor_train import TensorTrainDensity
 
 __all__ = [
-    "ConditionalParticleDensity", "Density", "GaussianMixture", "GridDensity", "IntervalDensity", "MappedDensity",
-    "ParticleDensity", "PointMasses", "ProductDensity", "TensorTrainDensity",
+    "ConditionalParticleDensity", "Density", "GaussianMixture", "GridDensity", "IntervalDensity", "LogarithmicDensity",
+    "MappedDensity", "ParticleDensity", "PointMasses", "ProductDensity", "TensorTrainDensity",
 ]  # fmt: skip

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,7 +14,8 @@ from zakai.densities.conditional import ConditionalParticleDensity
 from zakai.densities.gaussian import GaussianMixture
 from zakai.densities.grid import GridDensity
 from zakai.densities.interval import IntervalDensity
-from zakai.densities.mapped import MappedDensity
+from zakai.densities.logarithmic import LogarithmicDensity
+from zakai.densities.mapped import IntervalMap, MappedDensity
 from zakai.densities.particles import ParticleDensity
 from zakai.densities.points import PointMasses
 from zakai.densities.product import ProductDensity
@@ -42,14 +45,32 @@ def prior_table(density: Density) -> dict[str, Any]:
         return {"kind": "mixture", "weights": found.weights, "means": found.means, "covs": found.covs}
     if isinstance(found, IntervalDensity):
         return {"kind": "interval", "values": found.values, "nodes": found.nodes, "rule": found.rule}
-    grid, ends = (found.grid, found.map.ends) if isinstance(found, MappedDensity) else (found, {})
-    return {"kind": "grid", "centre": grid.centre, "basis": grid.basis, "log_values": grid.log_values, **ends}
+    grid, more = grid_of(found)
+    return {"kind": "grid", "centre": grid.centre, "basis": grid.basis, "log_values": grid.log_values, **more}
 
 
-def plain(density: Density) -> GaussianMixture | GridDensity | IntervalDensity | MappedDensity:
+def grid_of(density: GridDensity | LogarithmicDensity | MappedDensity) -> tuple[GridDensity, dict[str, Any]]:
+    """Return the grid of a density, and what maps it to the states, by the names in a model file."""
+    if isinstance(density, LogarithmicDensity):
+        return density.grid, {"logarithms": [bool(one) for one in density.logarithms]}
+    return (density.grid, dict(density.map.ends)) if isinstance(density, MappedDensity) else (density, {})
+
+
+def mapped(grid: GridDensity, more: Mapping[str, Any]) -> GridDensity | LogarithmicDensity | MappedDensity:
+    """Return the density of the states from what `grid_of` returns."""
+    if "logarithms" in more:
+        return LogarithmicDensity(grid, tuple(more["logarithms"]))
+    return MappedDensity(grid, IntervalMap(more.get("lower", -np.inf), more.get("upper", np.inf))) if more else grid
+
+
+def plain(density: Density) -> GaussianMixture | GridDensity | IntervalDensity | LogarithmicDensity | MappedDensity:
     """Return the same density as a mixture with positive weights, on a grid, or between the ends of a domain."""
     if isinstance(density, IntervalDensity | MappedDensity):
         return density
+    if isinstance(density, LogarithmicDensity):
+        grid = plain(density.grid)
+        assert isinstance(grid, GridDensity)
+        return replace(density, grid=grid)
     if isinstance(density, ParticleDensity | ConditionalParticleDensity):
         return density.thinned(MOST_KERNELS).smoothed
     if isinstance(density, TensorTrainDensity) and len(density.names) > 2:

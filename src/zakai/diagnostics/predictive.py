@@ -29,6 +29,7 @@ from zakai.densities import (
     PointMasses,
     TensorTrainDensity,
 )
+from zakai.densities.logarithmic import LogarithmicDensity
 from zakai.densities.mapped import MappedDensity
 from zakai.engine.setting import Setting
 from zakai.methods.system.residuals import Sensors
@@ -84,7 +85,7 @@ class Mixture(NamedTuple):
             points = 0.5 * (faces[1:] + faces[:-1])[:, None]
             weights = np.exp(density.log_density(points))
             weights = weights / np.sum(weights)
-        elif isinstance(density, GridDensity | MappedDensity):
+        elif isinstance(density, GridDensity | LogarithmicDensity | MappedDensity):
             weights, points = density.weights, density.points
         else:
             return None

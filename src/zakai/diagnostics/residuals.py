@@ -10,7 +10,7 @@ the method.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -22,6 +22,7 @@ from zakai.diagnostics.predictive_evidence import PredictiveEvidence
 from zakai.engine.forecast import origin_of
 from zakai.engine.loop import CHUNK, Run, segments
 from zakai.errors import InputError
+from zakai.methods._protocol import State
 from zakai.models.features import OBSERVED_PATH
 from zakai.numerics.tangent_quadrature import MASS_ERROR
 
@@ -38,11 +39,12 @@ def residuals(result: FilterResult, seed: int = 0, first: int = 0, progress: Pro
     draws = np.random.default_rng(seed).uniform(size=record.values.shape)
     found: Array = np.full(draws.shape, np.nan)
     error, share = 0.0, 0.0
-    observed = [parts for parts in zip(plan.runs(record, "moments"), plan.blocks, strict=True) if parts[1].observations]
+    runs = zip(plan.runs(record, "moments"), plan.blocks, result._states, strict=True)
+    observed = [parts for parts in runs if parts[1].observations]
     with counting("computing residuals", len(observed) * (len(record) - first), progress) as counted:
-        for run, block in observed:
+        for run, block, states in observed:
             columns = list(block.observations)
-            for k, (below, upto), *errors in counted(_laws(run, first)):
+            for k, (below, upto), *errors in counted(_laws(run, states, first)):
                 found[k, columns] = below + draws[k, columns] * (upto - below)
                 error, share = max(error, errors[0]), max(share, errors[1])
     if error > MASS_ERROR:
@@ -60,26 +62,34 @@ def residuals(result: FilterResult, seed: int = 0, first: int = 0, progress: Pro
     return found
 
 
-def _laws(run: Run, first: int) -> Iterator[tuple[int, Pair, float, float]]:
-    """Yield k, (P(Z < z), P(Z <= z)), both (m,), the error of the mass of a law and the `length_share`, from row `first` on."""
+def _laws(run: Run, states: Sequence[State] | None, first: int) -> Iterator[tuple[int, Pair, float, float]]:
+    """Yield k, (P(Z < z), P(Z <= z)), both (m,), the error of the mass of a law and the `length_share`, from row `first` on.
+
+    `states` are those at the start and after each interval; the record is filtered where they are not known.
+    """
     setting, model = run.setting, run.setting.model
     if model.observation_kind == "samples" and model.log_density is not None and model.m > 1:
         raise InputError(f"{model.source}: residuals: observation_log_density of several coordinates gives no law of one of them")
     if OBSERVED_PATH in model.features:
         raise InputError(f"{model.source}: residuals: an increment has no law here where formulas contain what is observed")
     spread = [_spread(run.values[run.schedule.seen[:, j], j]) for j in range(model.m)]
-    for segment in segments(setting, run.schedule, run.state, run.values):
-        if segment.rows.start == 0:
-            chunk = run.schedule.part(slice(segment.first, segment.first + CHUNK))
+    for k, before in enumerate(_states_before(run) if states is None else states[:-1]):
+        place = k % CHUNK
+        if place == 0:
+            chunk = run.schedule.part(slice(k, k + CHUNK))
             sums = PredictiveSums(setting, chunk)
             evidence = PredictiveEvidence(setting, chunk, sums, spread)
-        for i, before in enumerate([segment.before, *segment.states[:-1]]):
-            k, place = segment.first + i, segment.rows.start + i
-            if k < first:
-                continue
-            with np.errstate(all="ignore"):
-                law = sums.row(place, before, run.values[k]) or evidence.row(place, before, run.values[k])
-            yield k, law, evidence.mass_error, sums.length_share
+        if k < first:
+            continue
+        with np.errstate(all="ignore"):
+            law = sums.row(place, before, run.values[k]) or evidence.row(place, before, run.values[k])
+        yield k, law, evidence.mass_error, sums.length_share
+
+
+def _states_before(run: Run) -> Iterator[State]:
+    """Yield the state before each interval, from the filter."""
+    for segment in segments(run.setting, run.schedule, run.state, run.values):
+        yield from [segment.before, *segment.states[:-1]]
 
 
 def _spread(values: Array) -> tuple[float, float]:

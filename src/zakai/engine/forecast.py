@@ -28,7 +28,7 @@ def origin_of(result: FilterResult, what: str) -> tuple[Plan, tuple[State, ...],
     """
     if result.origin is None and result._again is not None:
         computed = result._again()
-        result.origin, result.record = computed.origin, computed.record
+        result.origin, result.record, result._states = computed.origin, computed.record, computed._states
     if result.origin is None or result.record is None:
         raise InputError(
             f"{what}: a result that was read from a file does not hold its filter; filter the record again, or save it with "

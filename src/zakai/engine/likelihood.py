@@ -31,6 +31,7 @@ from zakai.numerics.one_thread import one_thread
 from zakai.records import Inputs, Record
 from zakai.records.schedule import Schedule
 
+OF_TOLERANCE = 0.1  # nats by which a log-likelihood on grids of several states jumps, in tolerances (measured: 0.01 to 0.1)
 SHORT = 0.02  # seconds of one evaluation below which threads do not pay
 JUMPS = sp.sign, Floor
 
@@ -198,6 +199,13 @@ class LogLikelihood:
         except InputError:
             return missing
         return value, gradient, exceeded
+
+    @property
+    def jumps(self) -> float:
+        """The nats by which log-likelihoods of values close by may differ because grids of several states differ."""
+        settings = [part.setting for part in self._parts]
+        grids = [one for one in settings if one.model.n > 1 and "tolerance_ratio" in one.method.bounds]
+        return OF_TOLERANCE * max((float(getattr(one.begin()[0], "tolerance", 0.0)) for one in grids), default=0.0)
 
     def exists(self, values: np.ndarray) -> bool:
         """Return whether the model holds at the values (p,), by preparing its first interval, which takes little time."""

@@ -204,6 +204,12 @@ class Run:
         first = self.setting.method.density(self.empty, self.first)
         return first.mean(), first.cov()
 
+    @property
+    def kept_states(self) -> Sequence[State] | None:
+        """The states at the start and after every interval, None where they were not kept with all that a step needs."""
+        whole = self.setting.method.reduced is None and len(self.states) == len(self.schedule) + 1
+        return self.states if whole else None
+
     def density(self, index: int) -> Density:
         """Return the density at an index of the result."""
         return self.setting.method.density(self.empty, self.states[index])
@@ -219,7 +225,9 @@ class Run:
             found = distances(self.setting, result.mean[1:], result.cov[1:], self.again)
             return None if found is None else np.append(found[:1], found)
 
-        return warnings_of_run(result, self.setting.method.losses, apart)
+        # Of one state the error that is promised is not the tolerance for which substeps are chosen.
+        asked = getattr(self.empty, "promised", getattr(self.empty, "tolerance", None))
+        return warnings_of_run(result, self.setting.method.losses, apart, asked)
 
     def again(self, setting: Setting, done: Done) -> Infos:
         """Return what another setting of the method reports after each interval; `done` is called with the number of these."""

@@ -73,6 +73,7 @@ class Plan(NamedTuple):
             result = joined_blocks(self.model, self.division, runs, warned)
         result.warnings.extend(notes_on_increments(result.times, result.increment_law_error))
         result.origin = self, tuple(run.state for run in runs)
+        result._states = tuple(run.kept_states for run in runs)
         return result
 
 

@@ -77,6 +77,7 @@ class FilterResult:
     _density: Callable[[int], Density] | None = None
     _no_density: str = "the densities were not kept"
     _quantiles: tuple[np.ndarray, np.ndarray] | None = None  # of a result that was stored: levels (L,) and values (L, K+1, n)
+    _states: tuple[Sequence[State] | None, ...] = ()  # of each run at the indices of the result, where they were kept
     _again: Callable[[], FilterResult] | None = None  # computes a result that was stored again
 
     def __repr__(self) -> str:

@@ -191,11 +191,12 @@ def fit(
             if key not in known:
                 if advance is not None:
                     advance(len(known) + 1, None)
-                known[key] = function.unwarned(theta)
+                known[key] = function.consistent_pair(theta)
                 announce(len(known), *(count * (1 + len(names)) for count in USUAL))
             return known[key]
 
-        found = with_signs_of(values, maximum(counted, values, box, names, model, function.exists), counted, box)
+        found = maximum(counted, values, box, names, model, function.exists, function.jumps)
+        found = with_signs_of(values, found, counted, box)
     values = found.values
     now = model.with_parameters(**dict(zip(names, values.tolist(), strict=True)))
     result = run_filter(now, record, method, keep="moments", **options)

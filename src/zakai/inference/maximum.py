@@ -57,11 +57,11 @@ class _LimitReached(Exception):  # noqa: N818  # ends the search
 class _Objective:
     """The negative log-likelihood of the parameters in units of `scale`, and its gradient.
 
-    `beyond`: the last values without a log-likelihood.
+    `beyond`: the last values without a log-likelihood; `jumps`: nats by which values close by differ by chance.
     """
 
-    def __init__(self, function: Function, origin: np.ndarray, scale: np.ndarray):
-        self._both = function
+    def __init__(self, function: Function, origin: np.ndarray, scale: np.ndarray, jumps: float = 0.0):
+        self._both, self.jumps = function, jumps
         self.origin, self.scale = origin, scale
         self.best: tuple[float, np.ndarray, np.ndarray] | None = None
         self.beyond: np.ndarray | None = None
@@ -107,10 +107,12 @@ def hessian(gradient: Callable[[np.ndarray], np.ndarray], u: np.ndarray, steps: 
     return np.asarray(0.5 * (matrix + matrix.T))
 
 
-def _search(function: Function, start: np.ndarray, value: float, gradient: np.ndarray, limits: np.ndarray) -> OptimizeResult:
+def _search(
+    function: Function, start: np.ndarray, value: float, gradient: np.ndarray, limits: np.ndarray, gain: float
+) -> OptimizeResult:
     """Return what L-BFGS-B finds from a start with this value and gradient, without success where it reaches a limit."""
     gtol = 1e-7 * max(FIRST, np.abs(gradient).max() * 1e-3)
-    settings = {"maxiter": ITERATIONS, "ftol": GAIN / max(1.0, abs(value)), "gtol": gtol}
+    settings = {"maxiter": ITERATIONS, "ftol": gain / max(1.0, abs(value)), "gtol": gtol}
     path: list[np.ndarray] = []
     try:
         return minimize(function, start, jac=True, method="L-BFGS-B", bounds=limits, options=settings, callback=path.append)
@@ -132,7 +134,7 @@ def _along(objective: _Objective, limit: Limit, gap: float, limits: np.ndarray) 
         return value, (gradient + gradient[limit.axis] * limit.slope(u))[others]
 
     value, u, gradient = objective.best
-    return int(_search(held, u[others], value, gradient, limits[others]).nit)
+    return int(_search(held, u[others], value, gradient, limits[others], max(GAIN, objective.jumps)).nit)
 
 
 class _Searched(NamedTuple):
@@ -149,7 +151,7 @@ def _searched(objective: _Objective, exists: Exists, limits: np.ndarray) -> _Sea
     for _ in range(ROUNDS):
         assert objective.best is not None
         value, u, gradient = objective.best
-        search = _search(objective, u, value, gradient, limits)
+        search = _search(objective, u, value, gradient, limits, max(GAIN, objective.jumps))
         iterations += int(search.nit)
         if search.hess_inv is not None:
             return _Searched(search, iterations, None)
@@ -168,20 +170,26 @@ def _searched(objective: _Objective, exists: Exists, limits: np.ndarray) -> _Sea
 
 
 def maximum(
-    function: Function, values: np.ndarray, box: np.ndarray, names: tuple[str, ...], model: Model, exists: Exists
+    function: Function,
+    values: np.ndarray,
+    box: np.ndarray,
+    names: tuple[str, ...],
+    model: Model,
+    exists: Exists,
+    jumps: float = 0.0,
 ) -> Found:
     """Return the maximum of the likelihood from `values`.
 
     Where a parameter has changed its sign or its size by far, which may lead across a pole, a second search keeps the signs, in
     the logarithms of the sizes, and the higher end counts.  Where the search ends at values from which the log-likelihood curves
     upwards, it goes on from the best ones in that direction; where it ends on a plateau, from the best of the values that are
-    larger and smaller than the first ones by up to two decades.
+    larger and smaller than the first ones by up to two decades.  Log-likelihoods of values close by may differ by `jumps`.
     """
-    found = _maximum(function, values, box, names, model, exists)
+    found = _maximum(function, values, box, names, model, exists, jumps)
     with np.errstate(divide="ignore", invalid="ignore"):
         moved = np.where(values == 0, 1.0, found.values / values)
     if ((moved < 1.0 / FAR) | (moved > FAR)).any():
-        later = _maximum(function, _by_size(function, values, box), box, names, model, exists)
+        later = _maximum(function, _by_size(function, values, box), box, names, model, exists, jumps)
         known = later.converged or not found.converged  # a plateau far away does not replace a maximum
         if known and later.log_likelihood > found.log_likelihood + LIMIT:
             found = replace(later, iterations=found.iterations + later.iterations)
@@ -189,13 +197,13 @@ def maximum(
         start = _uphill(function, found, box)
         if start is None:
             break
-        later = _maximum(function, start, box, names, model, exists)
+        later = _maximum(function, start, box, names, model, exists, jumps)
         if not later.log_likelihood > found.log_likelihood:
             break
         found = replace(later, iterations=found.iterations + later.iterations)
     start = _beside_plateau(function, found, values, box)
     if start is not None:
-        later = _maximum(function, start, box, names, model, exists)
+        later = _maximum(function, start, box, names, model, exists, jumps)
         if later.log_likelihood > found.log_likelihood + LIMIT:
             found = replace(later, iterations=found.iterations + later.iterations)
     return found
@@ -263,11 +271,17 @@ def _uphill(function: Function, found: Found, box: np.ndarray) -> np.ndarray | N
 
 
 def _maximum(
-    function: Function, values: np.ndarray, box: np.ndarray, names: tuple[str, ...], model: Model, exists: Exists
+    function: Function,
+    values: np.ndarray,
+    box: np.ndarray,
+    names: tuple[str, ...],
+    model: Model,
+    exists: Exists,
+    jumps: float,
 ) -> Found:
     """Return the maximum by L-BFGS-B, and then Newton's steps in the free parameters."""
     scale = FIRST * np.where(values != 0, np.abs(values), 1.0)
-    objective, u = _Objective(function, values, scale), np.zeros(len(values))
+    objective, u = _Objective(function, values, scale, jumps), np.zeros(len(values))
     value, gradient = objective.exact(u)
     if not np.isfinite(value):
         at = ", ".join(f"{name} = {float(number):g}" for name, number in zip(names, values, strict=True))
@@ -290,21 +304,22 @@ def _maximum(
             information, place = _information(objective, u, deviations, free), u
         cov, distance, problem = _inverse(information, gradient, free, names)
         if not np.isfinite(distance) or distance < 1e-2 * NEAR:
-            if not np.any(np.abs(u - place)[free] > NEAR * np.sqrt(np.diag(cov)[free])):
+            if not np.any(np.abs(u - place)[free] > max(NEAR, np.sqrt(2.0 * jumps)) * np.sqrt(np.diag(cov)[free])):
                 break
             information, deviations = np.zeros((0, 0)), np.sqrt(np.diag(cov))  # of the place where the search has ended
             continue
-        # Newton's step, in the box; where it gains nothing, rounding has been reached.
+        # Newton's step, in the box; where it gains nothing, rounding or the jumps have been reached.
         step = np.nan_to_num(cov) @ np.where(free, gradient, 0.0)
         for halvings in range(HALVINGS):
             trial = np.clip(u - 0.5**halvings * step, limits[:, 0], limits[:, 1])
             new, slope = objective.exact(trial)
             if np.isfinite(new) or objective.at_limit(u, gradient):
                 break
-        if not new <= value + 1e-13 * abs(value):
+        if not new <= value + max(1e-13 * abs(value), jumps):
             break
         value, u, gradient, iterations = new, trial, slope, iterations + 1
-    converged = bool(distance < NEAR) if np.isfinite(distance) else bool(search.success and not problem.startswith("the log"))
+    near = max(NEAR, float(np.sqrt(2.0 * jumps)))
+    converged = bool(distance < near) if np.isfinite(distance) else bool(search.success and not problem.startswith("the log"))
     if converged or u.any():  # Newton's steps have left the limit
         beyond = objective.beyond if not converged and objective.at_limit(u, gradient) else None
     problem = problem if beyond is None else ""

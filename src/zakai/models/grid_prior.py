@@ -9,9 +9,8 @@ import numpy as np
 import sympy
 from numpy.typing import NDArray
 
-from zakai.densities import Density, GridDensity, IntervalDensity, MappedDensity
-from zakai.densities.as_prior import MOST_NUMBERS
-from zakai.densities.mapped import IntervalMap
+from zakai.densities import Density, GridDensity, IntervalDensity
+from zakai.densities.as_prior import MOST_NUMBERS, mapped
 from zakai.errors import InputError
 from zakai.models._entries import array, items, kind_of, number
 from zakai.models._errors import named
@@ -71,15 +70,18 @@ def read_grid(
             raise InputError(f"expected at most {MOST_NUMBERS:,} numbers on a full grid of {n} axes; its shape is {values.shape}")
         if np.isnan(values).any() or not np.isfinite(values.max()):
             raise InputError("expected logarithms of a density: finite, or -inf where it is zero")
-    density: Density = GridDensity(values, centre, basis, tuple(map(str, states)), periodic)
+    grid = GridDensity(values, centre, basis, tuple(map(str, states)), periodic)
     table = {"kind": "grid", "centre": centre.tolist(), "basis": basis.tolist(), "log_values": values.tolist()}
-    ends = {key: _number_of(keys, key) for key in ("lower", "upper") if keys.get(key) is not None}
-    if ends:
-        lower, upper = ends.get("lower", -np.inf), ends.get("upper", np.inf)
-        if n > 1 or not lower < upper:
-            raise InputError("lower, upper: expected the natural ends of the domain of the only state, lower < upper")
-        density = MappedDensity(GridDensity(values, centre, basis, density.names, periodic), IntervalMap(lower, upper))
-    return table_function(GridFunction(density))(*states), {**table, **ends}  # type: ignore[arg-type]
+    more: dict[str, Any] = {key: _number_of(keys, key) for key in ("lower", "upper") if keys.get(key) is not None}
+    if more and (n > 1 or not more.get("lower", -np.inf) < more.get("upper", np.inf)):
+        raise InputError("lower, upper: expected the natural ends of the domain of the only state, lower < upper")
+    if keys.get("logarithms") is not None:
+        chosen = list(keys["logarithms"]) if isinstance(keys["logarithms"], list | tuple) else []
+        circle = any(angle and bool(one) for angle, one in zip(periodic, chosen, strict=False))
+        if more or len(chosen) != n or not all(isinstance(one, bool) for one in chosen) or not any(chosen) or circle:
+            raise InputError(f"logarithms: expected {n} booleans: of which states, no angles, the grid has the logarithm")
+        more = {"logarithms": chosen}
+    return table_function(GridFunction(mapped(grid, more)))(*states), {**table, **more}  # type: ignore[arg-type]
 
 
 def _number_of(keys: Mapping[str, Any], key: str) -> float:

@@ -117,7 +117,7 @@ _KEYS = {
     "grid": ("log_values", "centre", "basis"),
     "interval": ("values", "nodes", "rule"),
 }
-_OPTIONAL = {"grid": ("lower", "upper")}
+_OPTIONAL = {"grid": ("lower", "upper", "logarithms")}
 
 
 def read_prior(

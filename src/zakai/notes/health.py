@@ -50,6 +50,7 @@ _PARTICLES, _COMPARE = "take guided-particles", "compare with guided-particles"
 _MORE_COMPONENTS = f"{_OTHER_METHOD}, or raise the option components"
 _WIDER_PRIOR = "give a wider prior, if it is not meant so narrow"
 NOTICEABLE = 1e-3  # deviations: an error of the mean within three digits of the deviation
+SLIGHT = 0.05  # deviations: an error of the mean up to which its size says enough, without advice
 VISIBLE = 0.1  # deviations: an error that draws can confirm
 UNKNOWN = 1.0  # deviations: an estimated error as large as the density is wide says that it may be lost
 MANY = 4  # states on a grid, which is too coarse for most densities then
@@ -107,13 +108,18 @@ def warnings_of_step(health: Mapping[str, Any], bounds: Bounds, lost: Mapping[st
             said.append(f"{name} is {value:.2g} and exceeds {bound:g}: {advised(name, what)}")
         elif error >= UNKNOWN:
             said.append(f"the density may be lost (error_estimate is {error:.2g} deviations); {_COMPARE}")
+        elif NOTICEABLE < error <= SLIGHT:
+            said.append(f"the mean may be off by up to {error:.1g} standard deviations (tolerance_ratio is {value:.2g})")
         elif error > NOTICEABLE:
             said.append(f"the mean may be off by up to {error:.1g} deviations (tolerance_ratio is {value:.2g}); {_COMPARE}")
     return said
 
 
 def warnings_of_run(
-    result: Result, lost: Mapping[str, float] | None = None, distances: Callable[[], Array | None] = lambda: None
+    result: Result,
+    lost: Mapping[str, float] | None = None,
+    distances: Callable[[], Array | None] = lambda: None,
+    asked: float | None = None,
 ) -> list[str]:
     """Return a sentence for every bound that a result exceeds, and for values that are not finite.
 
@@ -122,6 +128,7 @@ def warnings_of_run(
         lost: For a figure the value above which a step has lost the density.
         distances: Returns how far the moments are from those at a coarser tolerance, in deviations (K+1,), None where that is
             not known; it is called where the estimates of the method exceed their bounds.
+        asked: The tolerance of the method, None where it has none.
     """
     limits: Mapping[str, float] = lost or {}
     said: list[str] = []
@@ -150,7 +157,7 @@ def warnings_of_run(
         over = np.asarray(result.health[name] > bound) if name in result.health else np.zeros(0, bool)
         if name == "tolerance_ratio" and "error_estimate" in result.health:
             over[first:] = False
-            said += _of_tolerance(result, over, distances) if over.any() else []
+            said += _of_tolerance(result, over, distances, asked) if over.any() else []
             continue
         if name in limits:  # of later rows it is said that the density is lost
             over[first:] = False
@@ -182,10 +189,13 @@ def _lost_by_figure(result: Result, limits: Mapping[str, float], said: list[str]
     return first
 
 
-def _of_tolerance(result: Result, over: Array, distances: Callable[[], Array | None]) -> list[str]:
+def _of_tolerance(
+    result: Result, over: Array, distances: Callable[[], Array | None], asked: float | None
+) -> list[str]:
     """Return by how much the moments may be off, and from when on, where steps missed the tolerance; nothing if by little.
 
     The estimate of the method is a bound, and so is the distance from a result of a coarser tolerance: the smaller one counts.
+    An error that is slight is said with its size and what was asked, without advice.
     """
     errors = np.nan_to_num(np.asarray(result.health["error_estimate"], float), nan=0.0)
     if not errors.max() > NOTICEABLE:
@@ -204,6 +214,10 @@ def _of_tolerance(result: Result, over: Array, distances: Callable[[], Array | N
         last, largest = int(off[off < end][-1]), float(errors[off[0] : end].max())
         start, stop = (f"t = {result.times[k]:.12g}" for k in (off[0], last))
         when = f"from {start} on" if last + 1 == end else f"at {start}" if last == off[0] else f"from {start} to {stop}"
+        if largest <= SLIGHT and not len(unknown):
+            wanted = "" if asked is None else f"; asked: {asked:.1g}"
+            size = f"{largest:.1g} standard deviations, {when}"
+            return [f"the means may be off by about {size}{wanted} (tolerance_ratio: {ratio:.2g})"]
         size = f"{largest:.1g} deviations, {when}"
         change = advice if largest > (OF_PARTICLES if len(result.state) >= MANY else VISIBLE) else _MORE_OBSERVATIONS
         said.append(f"the means may be off by about {size} {figure}; {change}")

@@ -59,6 +59,7 @@ def prior_grid(
     tolerance: float = 1e-12,
     aligned: bool = True,
     source: str = "prior: log_density",
+    box: tuple[Array, Array] | None = None,
 ) -> PriorGrid:
     """Return a grid for a density with unknown location and scale, which may have several peaks.
 
@@ -72,6 +73,7 @@ def prior_grid(
         tolerance: bound on the neglected density, relative to its maximum.
         aligned: whether the axes of the grid are the coordinate axes; else the Cholesky factor of the covariance where n > 1.
         source: what an error message calls the density.
+        box: the ends, low and high (n,), of a box that holds the peaks, which are not sought then.
 
     Returns:
         The grid; `error` above `tolerance` tells that the density has kinks or jumps, or needs more points than allowed.
@@ -89,7 +91,7 @@ def prior_grid(
             values = np.asarray(log_density(x)).reshape(offsets.shape[:-1])
         return values
 
-    low, high = box_of_peaks(evaluate, n, angles, tolerance, source)
+    low, high = box_of_peaks(evaluate, n, angles, tolerance, source) if box is None else box
     grid = _fitted(evaluate, np.asarray(low, float), np.asarray(high, float), np.eye(n), angles, tolerance, source)
     if n > 1 and not aligned and not any(angles):
         weights = np.exp(grid.log_values.real - np.max(grid.log_values.real)).ravel()

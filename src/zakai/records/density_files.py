@@ -4,12 +4,20 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 
-from zakai.densities import Density, GaussianMixture, GridDensity, IntervalDensity, MappedDensity, TensorTrainDensity
-from zakai.densities.as_prior import plain
-from zakai.densities.mapped import IntervalMap
+from zakai.densities import (
+    Density,
+    GaussianMixture,
+    GridDensity,
+    IntervalDensity,
+    LogarithmicDensity,
+    MappedDensity,
+    TensorTrainDensity,
+)
+from zakai.densities.as_prior import grid_of, mapped, plain
 from zakai.errors import InputError
 from zakai.numerics.trains.grid import Grid
 from zakai.numerics.trains.train import Train
@@ -35,11 +43,11 @@ def save_density(density: Density, path: str | os.PathLike[str]) -> None:
         write_checkpoint(path, train, arrays, KIND)
         return
     found = plain(density)
-    ends: dict[str, float] = {}
-    if isinstance(found, MappedDensity):
-        ends, found = found.map.ends, found.grid
+    extra: dict[str, Any] = {}
+    if isinstance(found, MappedDensity | LogarithmicDensity):
+        found, extra = grid_of(found)
     kind = "interval" if isinstance(found, IntervalDensity) else "grid" if isinstance(found, GridDensity) else "mixture"
-    about = {"kind": kind, "names": list(found.names), "periodic": [bool(angle) for angle in found.periodic], **ends}
+    about = {"kind": kind, "names": list(found.names), "periodic": [bool(angle) for angle in found.periodic], **extra}
     write_checkpoint(path, about, {name: getattr(found, name) for name in _PARTS[kind]}, KIND)
 
 
@@ -81,12 +89,17 @@ def load_density(path: str | os.PathLike[str]) -> Density:
         fits &= all(isinstance(name, str) and name.isidentifier() for name in names)
         fits &= len(periodic) == n > 0 and all(isinstance(angle, bool) for angle in periodic)
         fits &= all(isinstance(end, float) and np.isfinite(end) for end in ends.values())
+        more: dict[str, Any] = {name: about[name] for name in ("logarithms", *ends) if name in about}
         if not fits:
             raise damaged
         if kind == "grid":
             fits = parts["log_values"].ndim == n and parts["centre"].shape == (n,) and parts["basis"].shape == (n, n)
             fits &= bool(np.isfinite(parts["centre"]).all() and np.linalg.matrix_rank(parts["basis"]) == n)
             fits &= not np.isnan(parts["log_values"]).any() and bool(np.isfinite(parts["log_values"].max()))
+            if "logarithms" in more:
+                chosen = more["logarithms"]
+                fits &= isinstance(chosen, list) and len(chosen) == n and all(isinstance(one, bool) for one in chosen)
+                fits &= not ends and not any(one and angle for one, angle in zip(chosen, periodic, strict=True))
             fits &= not ends or (n == 1 and ends.get("lower", -np.inf) < ends.get("upper", np.inf))
         elif kind == "interval":
             count = len(parts["nodes"])
@@ -108,8 +121,7 @@ def load_density(path: str | os.PathLike[str]) -> Density:
         return IntervalDensity(**parts, names=names)
     if kind == "mixture":
         return GaussianMixture(**parts, names=names, periodic=periodic)
-    grid = GridDensity(**parts, names=names, periodic=periodic)
-    return MappedDensity(grid, IntervalMap(ends.get("lower", -np.inf), ends.get("upper", np.inf))) if ends else grid
+    return mapped(GridDensity(**parts, names=names, periodic=periodic), more)
 
 
 def _train(names: tuple[str, ...], periodic: tuple[bool, ...], arrays: Mapping[str, np.ndarray]) -> TensorTrainDensity | None:

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zakai.densities.grid import GridDensity
+from zakai.densities import Density
 from zakai.errors import InputError
 from zakai.methods._protocol import Backward, Info
 from zakai.methods.space import kolmogorov as base
@@ -23,7 +23,6 @@ from zakai.methods.space.cross import cross_formulas
 from zakai.methods.space.filter import State
 from zakai.methods.space.paths import drawn
 from zakai.methods.space.short import predicted_on
-from zakai.methods.space.system import moments_of
 from zakai.numerics.space.adjoint import Adjoint
 from zakai.numerics.space.advance import Control
 from zakai.numerics.space.field import NOTHING, Field, Report, grid_report, positive
@@ -74,6 +73,7 @@ def message(prepared: base.Prepared, state: State) -> Message:
     Raises:
         InputError: splitting="lie", whose filter solves another equation.
     """
+    prepared = prepared.of(state)
     if prepared.lie:
         source = prepared.model.source
         raise InputError(f'{source}: smooth: splitting="lie" has no backward pass for several states; take "strang"')
@@ -90,13 +90,15 @@ def _density(prepared: base.Prepared, state: State) -> Field:
 
 def smoothed(prepared: base.Prepared, state: State, later: Message) -> tuple[Message, Info]:
     """Return the message, normalised so that its product with the state has mass one, and the report of the product."""
+    prepared = prepared.of(state)
     general, update = _general(prepared), later.product
     found, bounds, tolerance = update.field, general.bounds, general.tolerance
     with np.errstate(all="ignore"):
-        mean, cov = moments_of(found.values, found.grid, prepared.angles)
+        mean, cov, cut = general.moments(found)
         log_mass = float(found.log_mass)
-        spacings = np.sqrt(np.maximum(np.diagonal(found.grid.inverse @ cov @ found.grid.inverse.T), 0.0))
-    edge, tails = max(update.edges, later.report.edges), max(update.tails, later.report.tails) ** 4
+        spread = found.survey(bounds).cov
+        spacings = np.sqrt(np.maximum(np.diagonal(found.grid.inverse @ spread @ found.grid.inverse.T), 0.0))
+    edge, tails = max(update.edges, later.report.edges, cut), max(update.tails, later.report.tails) ** 4
     error = later.error if np.isfinite(log_mass) else np.inf
     figures = (
         float(state.error) + error,
@@ -114,6 +116,7 @@ def smoothed(prepared: base.Prepared, state: State, later: Message) -> tuple[Mes
 
 def step(prepared: base.Prepared, k: int, later: Message, values: np.ndarray, state: State) -> Message:
     """Return the message at the start of interval k from that at its end; `state` is the filter's at the start."""
+    prepared = prepared.of(state)
     if not state.error < base.LOST:  # of the filter nothing is known here
         return message(prepared, state)._replace(error=1.0)
     general, begin = _general(prepared), _density(prepared, state)
@@ -267,27 +270,30 @@ def _through(
     return function, product, shown
 
 
-def density(prepared: base.Prepared, state: State, later: Message) -> GridDensity:
+def density(prepared: base.Prepared, state: State, later: Message) -> Density:
     """Return the smoothed density, on a grid that resolves it as those of the filter do."""
+    prepared = prepared.of(state)
     bounds = _general(prepared).bounds
 
     def log_factor(grid: Grid) -> Array:
         return interpolated(later.function, grid, bounds.periodic).reshape(-1)
 
-    found = updated(_density(prepared, state), log_factor, bounds, 0.0, later.function.grid).field
-    with np.errstate(divide="ignore"):
-        logs = np.log(found.values)
-    return GridDensity(logs, found.grid.centre, found.grid.basis, prepared.model.state, prepared.angles)
+    return prepared.posterior(updated(_density(prepared, state), log_factor, bounds, 0.0, later.function.grid).field)
 
 
 @np.errstate(all="ignore")
 def draw(prepared: base.Prepared, k: int, later: Array, values: Array, state: State, rng: Any) -> tuple[Array, float]:
     """Return draws (P, n) of the state at the start of interval k given those at its end, and how far the law is from normal."""
+    prepared = prepared.of(state)
     general, begin = _general(prepared), _density(prepared, state)
     if general.observations.lengths[k] == 0:
         return later, 0.0
+    chosen = list(general.logarithms)
     taken = _substeps(general, k, begin, _control(prepared, state), values, general.allowed(state), 1)
-    return drawn([(stepper, one) for stepper, group in taken for one in group], begin, later, rng)
+    if any(chosen):
+        later = np.log(later, where=chosen, out=later.copy())
+    found, departure = drawn([(stepper, one) for stepper, group in taken for one in group], begin, later, rng)
+    return np.exp(found, where=chosen, out=found.copy()) if any(chosen) else found, departure
 
 
 def accuracy(prepared: base.Prepared) -> float:

@@ -10,9 +10,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zakai.densities.grid import GridDensity
+from zakai.densities import Density
 from zakai.methods._protocol import Info
-from zakai.models.model import Model
 
 
 class State(NamedTuple):
@@ -20,6 +19,7 @@ class State(NamedTuple):
 
     `rate`, `measured`, `age` and `fixed` control the substeps, `deviations` (n,) are those of the density for which `rate` was
     measured, `error` is the estimate of the relative error of the density, `kept` the share of it that an interval leaves.
+    `logarithmic`: the grid is that of logarithms of some states (`space/logarithms.py`).
     """
 
     values: np.ndarray
@@ -32,6 +32,7 @@ class State(NamedTuple):
     deviations: np.ndarray
     error: float
     kept: float
+    logarithmic: bool = False
 
 
 def init(prepared: Any, prior: Any) -> State:
@@ -42,17 +43,15 @@ def init(prepared: Any, prior: Any) -> State:
 
 def step(prepared: Any, k: int, state: State, values: np.ndarray) -> tuple[State, Info]:
     """Return the state after interval k and its observation, and what the step reports."""
-    result: tuple[State, Info] = prepared.step(k, state, values)
+    result: tuple[State, Info] = prepared.of(state).step(k, state, values)
     return result
 
 
-def density(prepared: Any, state: State) -> GridDensity:
+def density(prepared: Any, state: State) -> Density:
     """Return the posterior on its grid."""
-    model: Model = prepared.model
-    field = prepared.density(state)
-    with np.errstate(divide="ignore"):
-        logs = np.log(np.maximum(field.values.real, 0.0))
-    return GridDensity(logs, field.grid.centre, field.grid.basis, model.state, prepared.angles)
+    prepared = prepared.of(state)
+    found: Density = prepared.posterior(prepared.density(state))
+    return found
 
 
 def valid(prepared: Any, state: State) -> bool:

@@ -13,23 +13,26 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from zakai.densities import Density, GridDensity, LogarithmicDensity
 from zakai.errors import InputError
 from zakai.methods._options import tolerance_of
 from zakai.methods._protocol import Info
 from zakai.methods.space.cross import CrossSystem, potential_of
 from zakai.methods.space.filter import State
+from zakai.methods.space.logarithms import is_formula, mass_outside, prior_of_logarithms, with_logarithms
 from zakai.methods.space.observed import MOST_PANELS, Observations
 from zakai.methods.space.short import predicted_on
-from zakai.methods.space.system import System, grid_of, moments_of, prior_on_grid, system_of, valid_noise
+from zakai.methods.space.system import System, grid_of, moments_of, moments_of_exponentials, prior_on_grid, system_of, valid_noise
 from zakai.methods.system.escape_of_states import check_escape
 from zakai.methods.system.notes import OMITTED
 from zakai.models.features import CROSS_NOISE
 from zakai.models.model import Model
 from zakai.numerics.complex_step import is_complex
-from zakai.numerics.prior_grid import mixture_grid
+from zakai.numerics.prior_grid import PriorGrid, mixture_grid
 from zakai.numerics.space.advance import CHECKED, Control, advance
 from zakai.numerics.space.field import NOTHING, Field, Report, positive, spline_error
 from zakai.numerics.space.grid import Grid
+from zakai.numerics.space.rough import checked, for_rough
 from zakai.numerics.space.step import Stepper
 from zakai.numerics.space.survey import Survey
 from zakai.numerics.space.update import Update, updated
@@ -48,6 +51,7 @@ SHARE = 0.2  # of the tolerance, for the error in time of one interval
 LOST = 0.5  # error of a density relative to itself
 KEPT = 0.98  # largest share of an error that an interval is taken to leave
 OF_FIELDS = 3.0  # work where the noise depends on the state, in that of others (measured: 2 to 9)
+MOST_OUTSIDE = 0.05  # of the tolerance: mass of a prior where a logarithm has no value
 WIDER = 1.1  # growth of the deviations after which the error of a substep is measured again
 
 
@@ -63,7 +67,8 @@ class Prepared:
     """A model, a schedule and parameters, with the bounds that follow from the tolerance.
 
     `lie` tells whether the filter splits an interval at its end only, which has no backward pass.  An interval that needs more
-    than `most_work`, in grid points, raises ExhaustedError.
+    than `most_work`, in grid points, raises ExhaustedError.  With `logarithms` (n,) the model is that of the logarithms of some
+    states; `mapped` is what is prepared for that model, for a prior in which these states are positive.
     """
 
     model: Model
@@ -77,13 +82,30 @@ class Prepared:
     motions: dict[Any, Any] = field(default_factory=dict)
     lie: bool = False
     most_work: float = math.inf
+    logarithms: tuple[bool, ...] = ()
+    mapped: Prepared | None = None
+
+    def of(self, state: State) -> Prepared:
+        """Return what is prepared for the coordinates of a state."""
+        return self.mapped if state.logarithmic and self.mapped is not None else self
 
     def init(self, prior: Any) -> State:
-        """Return the prior on a grid."""
-        tolerance = min(self.bounds.edge, self.bounds.tail)
-        found = prior_on_grid(self.model, prior, self.theta, tolerance, self.bounds.periodic)
+        """Return the prior on a grid, of logarithms where these states are positive."""
+        tolerance, mapped = min(self.bounds.edge, self.bounds.tail), self.mapped
+        known = None
+        if mapped is None or is_formula(prior):
+            known = prior_on_grid(self.model, prior, self.theta, tolerance, self.bounds.periodic)
+        if mapped is not None:
+            outside, error = mass_outside(prior, mapped.logarithms, known)
+            if outside < MOST_OUTSIDE * self.tolerance:
+                of_w = mapped.model, prior, self.theta, tolerance, self.bounds.periodic, mapped.logarithms, known
+                return mapped.began(prior_of_logarithms(*of_w), error)
+        return self.began(known or prior_on_grid(self.model, prior, self.theta, tolerance, self.bounds.periodic), 0.0)
+
+    def began(self, found: PriorGrid, error: float) -> State:
+        """Return the state of a prior on a grid, with an error that it has already."""
         values = np.exp(found.log_values - np.max(found.log_values.real))
-        error = found.error if found.error > 1e-6 else 0.0
+        error += found.error if found.error > 1e-6 else 0.0
         grid = Grid(found.centre, found.basis, values.shape, found.closed)
         return self.started(positive(Field(values, grid, 0.0), self.bounds), error)
 
@@ -94,7 +116,8 @@ class Prepared:
 
     def bounded(self, points: float) -> Prepared:
         """Return the same with a bound on the work in an interval."""
-        return replace(self, most_work=points)
+        mapped = None if self.mapped is None else self.mapped.bounded(points)
+        return replace(self, most_work=points, mapped=mapped)
 
     @property
     def correlated(self) -> bool:
@@ -109,6 +132,19 @@ class Prepared:
     def density(self, state: State) -> Field:
         """Return the posterior on a grid."""
         return Field(state.values, grid_of(state, self.bounds.periodic), 0.0)
+
+    def posterior(self, field: Field) -> Density:
+        """Return a density on a grid as one of the states."""
+        with np.errstate(divide="ignore"):
+            logs = np.log(np.maximum(field.values.real, 0.0))
+        found = GridDensity(logs, field.grid.centre, field.grid.basis, self.model.state, self.angles)
+        return LogarithmicDensity(found, self.logarithms) if self.logarithms else found
+
+    def moments(self, field: Field) -> tuple[Array, Array, float]:
+        """Return the mean (n,) and covariance (n, n) of the states, and how much of a second moment may be off the grid."""
+        if not self.logarithms:
+            return *moments_of(field.values.real, field.grid, self.angles, field.survey(self.bounds)), 0.0
+        return moments_of_exponentials(field, self.angles, self.logarithms)
 
     def check_escape(self, k: int, state: State) -> None:
         """Raise InputError where paths escape from a density in interval k."""
@@ -146,7 +182,10 @@ class Prepared:
             update = Update(predicted, report.edges, report.tails, 0.0, False)
             if factor is not None:
                 wider = partial(observations.wider, begin, predicted, parts, self.bounds)
-                update = updated(predicted, factor, bounds, report.tails, wider=wider)
+                rough = self.system.rough
+                update = updated(predicted, factor, for_rough(bounds) if rough else bounds, report.tails, wider=wider)
+                if rough:
+                    update = checked(predicted, update, factor, bounds)
                 report = report._replace(interpolation=POINTWISE * report.interpolation)
             if before is not None and not report.splitting + report.of_grid(bounds.reach) < LOST:
                 (predicted, report, after, update), found = before, None
@@ -217,7 +256,7 @@ class Prepared:
                 points = mean + np.concatenate([np.zeros((1, len(mean))), np.diag(np.sqrt(np.diagonal(cov)))])
                 least = max(fewest, observations.least(points, start, length, inside))
             most_work = self.most_work / (OF_FIELDS if observations.system.state_dependent else 1.0)
-            stepper = Stepper(observations.dynamics, bounds, self.tolerance, most_work)
+            stepper = Stepper(observations.dynamics, bounds, self.tolerance, most_work, self.system.rough)
             if steppers is not None:
                 steppers.append(stepper)
             result, more, control = advance(stepper, result, start, length, potential, control, allowed / len(parts), least)
@@ -235,13 +274,17 @@ class Prepared:
     ) -> tuple[State, Info]:
         result = positive(update.field, self.bounds) if found is None else update.field
         mean, cov = moments_of(result.values.real, result.grid, self.angles, found or result.survey(self.bounds))
+        deviations = np.sqrt(np.maximum(cov.diagonal(), 0.0))
         mass = result.values.sum() * result.grid.cell
         gained = np.log(mass) + (result.log_scale + constant)
         if not report.splitting + report.of_grid(self.bounds.reach) < LOST and np.isfinite(update.depth):
             result, mass = self._gaussian(result, mean, cov), 1.0
+        cut = 0.0
+        if self.logarithms:
+            mean, cov, cut = self.moments(result)
         edge, tails = max(report.edges, update.edges), max(report.tails, update.tails)
         made = (report.splitting + report.interpolation) * update.growth + update.interpolation + min(update.cut, 1.0)
-        made = made + 1e-15 * np.exp(min(update.depth, 40.0)) + self.bounds.reach**2 * edge * 0.1 + tails
+        made = made + 1e-15 * np.exp(min(update.depth, 40.0)) + self.bounds.reach**2 * max(edge, cut) * 0.1 + tails
         made = made + math.hypot(report.removed, update.removed, 0.0 if found is not None else result.removed)
         left = kept * state.error
         error = float(np.sqrt(left**2 + 2 * ALIKE * left * made + made**2))
@@ -257,7 +300,6 @@ class Prepared:
             "std_in_spacings": math.sqrt(-2 * math.log(min(max(tails, 1e-15), 0.9))) / math.pi,
         }
         # The error of a substep grows steeply with the deviations.
-        deviations = np.sqrt(np.maximum(cov.diagonal(), 0.0))
         measured = deviations if control.age == 0 else state.deviations
         if any(not new / WIDER <= old <= WIDER**3 * new for new, old in zip(deviations.tolist(), measured.tolist(), strict=True)):
             control = control._replace(age=CHECKED)
@@ -281,7 +323,7 @@ class Prepared:
     def _state(self, found: Field, mass: Any, control: Control, deviations: Array, error: float, kept: float) -> State:
         return State(
             found.values / mass, found.grid.centre, found.grid.basis, float(control.rate), float(control.measured),
-            int(control.age), control.fixed, deviations, float(error), float(kept),
+            int(control.age), control.fixed, deviations, float(error), float(kept), bool(self.logarithms),
         )  # fmt: skip
 
     def _kept(self, begin: Field, predicted: Field, result: Field) -> float:
@@ -302,14 +344,22 @@ def prepare(model: Model, schedule: Schedule, theta: np.ndarray, *, tolerance: f
         tolerance: bound on the relative error of the density; 1e-3 by default.
     """
     tolerance = tolerance_of(tolerance, DEFAULT_TOLERANCE)
-    n = model.n
-    if n > 4:
-        raise InputError(f"{model.source}: a density grid is for at most four states, and there are {n}")
+    if model.n > 4:
+        raise InputError(f"{model.source}: a density grid is for at most four states, and there are {model.n}")
+    prepared = _prepared(model, schedule, np.asarray(theta), tolerance)
+    found = with_logarithms(model)
+    if found is None:
+        return prepared
+    mapped = _prepared(found[0], schedule, np.asarray(theta), tolerance)
+    return replace(prepared, mapped=replace(mapped, logarithms=found[1]))
+
+
+def _prepared(model: Model, schedule: Schedule, theta: np.ndarray, tolerance: float) -> Prepared:
     periodic = tuple(name in model.periodic for name in model.state)
     tail = min(tolerance**2, 1e-3 * tolerance)
     finer = max(spline_error(tail) / (OF_SPLINES * tolerance), 1.0) ** (1 / 6)
-    bounds = Bounds(1e-3 * tolerance, tail, MOST[n], periodic, finer=finer)
-    system, theta = system_of(model), np.asarray(theta)
+    bounds = Bounds(1e-3 * tolerance, tail, MOST[model.n], periodic, finer=finer)
+    system = system_of(model)
     tables, motions = ({}, {}) if is_complex(theta) else system.caches(theta)
     observations = Observations(model, schedule, system, theta, tables)
     gathered = CROSS_NOISE in model.features and bool((schedule.seen & ~schedule.inside).any())

@@ -10,7 +10,7 @@ import numpy as np
 from zakai.methods.space.system import System
 from zakai.numerics.complex_step import is_complex
 from zakai.numerics.space.advance import Control
-from zakai.numerics.space.field import Field, Report, extrapolated, grid_report, moments_difference, positive
+from zakai.numerics.space.field import ACCEPTED, Field, Report, extrapolated, grid_report, moments_difference, positive
 from zakai.numerics.space.fixed import LARGEST_RANGE, Motion, fits, fixed_step, motion, refitted
 from zakai.numerics.space.grid import Grid
 from zakai.numerics.space.survey import Survey
@@ -58,7 +58,10 @@ def predicted_on(
     if min(singles, 3 * pairs) > MOST_FIXED:
         return None
     moved, removed = motion_of(prepared, grid, length), 0.0
-    if length <= moved.longest and not fits(begin.survey(prepared.bounds), grid, prepared.bounds):
+    found = begin.survey(prepared.bounds)
+    if length <= moved.longest and not fits(found, grid, prepared.bounds):
+        if prepared.system.rough and found.tails.max() > ACCEPTED * prepared.bounds.tail:
+            return None  # the noise makes kinks smooth before the density is on another grid
         begin = positive(refitted(begin, prepared.bounds), prepared.bounds)
         removed = begin.removed
         grid, moved = begin.grid, motion_of(prepared, begin.grid, length)

@@ -13,19 +13,21 @@ import sympy
 from zakai.methods.space.filter import State
 from zakai.methods.space.functions import PointFunction
 from zakai.models.features import OF_OBSERVATION, STATE_DEPENDENT_DIFFUSION
-from zakai.models.functions import TableFunction, without_jumps
+from zakai.models.functions import Floor, Maximum, Minimum, TableFunction, without_jumps
 from zakai.models.kept import once_for_a_model
 from zakai.models.model import Model
 from zakai.models.numeric import numpy_function
 from zakai.models.prior import DensityPrior
 from zakai.numerics.prior_grid import PriorGrid, mixture_grid, prior_grid
 from zakai.numerics.space.average import average
+from zakai.numerics.space.field import Field
 from zakai.numerics.space.grid import Grid, weighted_products
 from zakai.numerics.space.survey import Survey, survey
 from zakai.numerics.space.transport import Dynamics
 from zakai.records.inputs import Inputs
 
 Array = Any
+_ROUGH: tuple[Any, ...] = (sympy.Abs, sympy.sign, Floor, Maximum, Minimum, TableFunction)
 Caches = tuple[dict[Any, Any], dict[Any, Any]]
 
 
@@ -51,6 +53,10 @@ class System:
         self.varies = self.varies or bool(model.u)
         # Whether samples have a law that is not N(h(x, t), S(t)).
         self.general = model.observation_kind == "samples" and bool(model.u or OF_OBSERVATION & model.features.keys())
+        # Whether the law of what is observed has kinks or jumps in the state.
+        parts = [*model.observation, *model.observation_noise, *model.family_parameters.values()]
+        calls = set().union(*(part.atoms(*_ROUGH) for part in [*parts, *([model.log_density] if model.log_density else [])]))
+        self.rough = any(call.has(*x) and not (isinstance(call, TableFunction) and call.table.degree > 1) for call in calls)
         self.tables = [(call.table, numpy_function(list(call.args), model, (len(call.args),))) for call in _table_calls(model)]
         self.state_dependent = STATE_DEPENDENT_DIFFUSION in model.features
         self._caches: dict[bytes, Caches] = {}
@@ -173,3 +179,24 @@ def moments_of(values: Array, grid: Grid, periodic: tuple[bool, ...], found: Sur
     apart = np.where(angle, apart - 2 * np.pi * np.round(apart / (2 * np.pi)), apart)
     where = grid.centre + mean
     return np.where(angle, np.pi - np.mod(np.pi - where, 2 * np.pi), where), weighted_products(weights, apart)
+
+
+def moments_of_exponentials(
+    field: Field, periodic: tuple[bool, ...], logarithms: tuple[bool, ...]
+) -> tuple[Array, Array, float]:
+    """Return the mean (n,) and covariance (n, n) of x, x_i = e^(w_i) for `logarithms`, from a real density of w on a grid.
+
+    The third is the largest value at the edges of the grid of the marginals of x_i^2 times the density, relative to their maxima.
+    """
+    grid, chosen = field.grid, np.flatnonzero(logarithms)
+    mean, cov = moments_of(field.values.real, grid, periodic)
+    weights, points = field.values.real.reshape(-1) / field.values.real.sum(), grid.points
+    x = np.exp(points[:, chosen])
+    apart = points - mean
+    apart = np.where(periodic, apart - 2 * np.pi * np.round(apart / (2 * np.pi)), apart)
+    mean, edges = mean.copy(), []
+    for d, column in zip(chosen, x.T, strict=True):
+        mean[d] = weights @ column
+        apart[:, d] = column - mean[d]
+        edges.append(survey((weights * (column / mean[d]) ** 2).reshape(grid.sizes), grid, 0.0).edges.max())
+    return mean, weighted_products(weights, apart), float(max(edges))

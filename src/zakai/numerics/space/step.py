@@ -25,9 +25,9 @@ from zakai.numerics.space.field import (
     positive,
     refinable,
 )
-from zakai.numerics.space.grid import Grid, filtered
+from zakai.numerics.space.grid import Grid, filtered, inverted
 from zakai.numerics.space.splitting import Move, Potential, Source, after_motion, before_motion
-from zakai.numerics.space.survey import deviations_in_spacings, narrowest, survey
+from zakai.numerics.space.survey import deviations_in_spacings, narrowest, smoothed, survey
 from zakai.numerics.space.transport import (
     Dynamics,
     Linearisation,
@@ -62,10 +62,12 @@ class Stepper:
     """Substeps of one interval.
 
     `work` are the grid points at which a density was computed, and `SUBSTEP_WORK` for each computation; a Runge-Kutta step of a
-    point counts as `STEP_WORK` points.  Before it is more than `most_work` an ExhaustedError is raised.
+    point counts as `STEP_WORK` points.  Before it is more than `most_work` an ExhaustedError is raised.  Densities are `rough`
+    where a likelihood has kinks or jumps.
     """
 
-    def __init__(self, dynamics: Dynamics, bounds: Bounds, tolerance: float, most_work: float = math.inf):
+    def __init__(self, dynamics: Dynamics, bounds: Bounds, tolerance: float, most_work: float = math.inf, rough: bool = False):
+        self.rough = rough
         self.dynamics, self.bounds, self.tolerance, self.most_work, self.work = dynamics, bounds, tolerance, most_work, 0.0
         self.taken: list[tuple[Substep, ...]] = []  # single substeps, and the two halves of extrapolated ones
         self._linearised: tuple[Array, tuple[float, ...], list[Linearisation]] | None = None
@@ -119,19 +121,25 @@ class Stepper:
         tolerance = 0.05 * self.tolerance * np.exp(-0.5 * logs)
         inverse, variances = grid.inverse, np.maximum(np.diagonal(found.cov), 1e-300)
         moves: list[Move] = []
-        noise, moved, steps = np.zeros_like(found.cov), np.zeros_like(start), 0
+        noise, moved, steps, through_all = np.zeros_like(found.cov), np.zeros_like(start), 0, np.eye(grid.n)
         for (a, b), linear in zip(pairwise(times), linears, strict=True):
             if not steps:
                 steps, moved = steps_needed(dynamics, grid.centre + start, a, b, inverse, tolerance)
             else:
                 with np.errstate(all="ignore"):
                     moved = moved + moved_points(dynamics, grid.centre + start + moved, a, b, steps)[:, : grid.n]
-            noise = linear.map.real @ noise @ linear.map.real.T + linear.noise.real
+            through_all = linear.map.real @ through_all
+            carried = linear.map.real @ noise @ linear.map.real.T
+            noise = carried + linear.noise.real
             good = np.isfinite(moved).all(axis=1)
             short = np.abs(moved[good] @ inverse.T).max(initial=0.0) < 1.5 and (np.diagonal(noise) / variances).max() < 0.2
             target = grid
             if not (short and holds) and good.any():
-                target = fitted_grid(Points((start + moved)[good], logs[good], grid.centre), noise, narrow, bounds, grid)
+                # The half of its noise that acts before the motion makes narrow parts wider before they are on the new grid.
+                through = inverse @ inverted(through_all)
+                before = through @ (carried + 0.5 * linear.noise.real) @ through.T
+                smooth = smoothed(narrow, found.conditional, before) if self.rough else narrow
+                target = fitted_grid(Points((start + moved)[good], logs[good], grid.centre), noise, smooth, bounds, grid)
             moves.append(Move(linear, steps, target))
         return moves
 

@@ -176,6 +176,18 @@ def narrowest(found: Survey, values: Array, tail: float, least: float = 0.0) -> 
     return np.minimum(width / found.conditional, 1.0), np.minimum(width, found.conditional)
 
 
+def smoothed(narrow: Array, conditional: Array, noise: Array) -> Array:
+    """Return the smallest standard deviations of `narrowest` (n,), in conditional ones, after noise (n, n) in squared spacings.
+
+    Along an axis the spectrum decreases at least by the variance of the noise given its other coordinates.
+    """
+    variances, own = np.diagonal(noise), conditional**2
+    scale = np.sqrt(np.maximum(variances, 1e-12 * own))
+    inverse = np.linalg.inv(noise / (scale[:, None] * scale) + 1e-6 * np.eye(len(noise)))
+    given = np.minimum(np.maximum(scale**2 / np.diagonal(inverse) - 2e-6 * scale**2, 0.0), variances)
+    return np.asarray(np.sqrt((narrow**2 * own + given) / (own + given)))
+
+
 def deviations_in_spacings(tails: Array) -> Array:
     """Return the standard deviation in spacings of a Gaussian with such a spectrum at the highest frequency."""
     return np.asarray(np.sqrt(-2 * np.log(np.clip(tails, 1e-15, 0.9))) / np.pi)
