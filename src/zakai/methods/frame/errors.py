@@ -95,7 +95,7 @@ class Error(NamedTuple):
         """Return the same function where an observation has moved the mean to z = shift, with the covariance B B'."""
         second = self.second + self.third @ shift
         change = np.outer(shift, shift) + B @ B.T - np.eye(len(shift))
-        first = self.first + self.second @ shift + 0.5 * np.einsum("ijk,jk->i", self.third, change)
+        first = self.first + self.second @ shift + 0.5 * self.third.reshape(len(shift), -1) @ change.ravel()
         return Error(B.T @ first, B.T @ second @ B, _turned(self.third, B.T), B.T @ self.spread @ B)
 
     def in_deviations(self, root: Array) -> float:
@@ -180,7 +180,8 @@ def _certain(third: Array, chance: float) -> Array:
 
 def _turned(third: Array, A: Array) -> Array:
     """Return third derivatives (n, n, n) along other axes: the rows of a matrix (n, n)."""
-    return np.asarray(np.einsum("ai,bj,ck,ijk->abc", A, A, A, third, optimize=True))
+    n = len(A)
+    return np.asarray(A @ (A @ third.reshape(n, -1)).reshape(n, n, n) @ A.T)
 
 
 def root_of(P: Array) -> Array:
