@@ -23,6 +23,8 @@ CLOUD = 1024
 # chosen, the largest error of a mean without a warning is 1.7 tolerances (2e-2), 4.4 with .6 and .25: errors in tails become
 # those of a mean where later observations lead there.
 SHARE, CORES = 0.4, 0.2
+# Share of the error of a core that rounding may add, and the rank above which that takes less time than evaluations save.
+ROUNDING, LARGE = 0.3, 8
 LEAST = 0.6  # of the tolerance that earlier errors may leave
 EDGE = 0.3  # share of the tolerance that may be near an end of an axis
 ROUGH = 4.0  # tolerances of error off the grid, above which the grid is made finer
@@ -33,6 +35,7 @@ LOOSEST = 0.1
 # deviations away from a linear track has an error of .1 to 4 tolerances with shares from .1 to 1e-3; in the tails of a density
 # that is not Gaussian (an angle whose noise depends on its rate) one has an error of .016 deviations with .1, .003 with 1e-3.
 TAILS = 1e-3
+SINGLE = 1e-5  # tolerance of a core down to which densities are evaluated in single precision, which is ten times as accurate
 WIDER = 0.25  # share of a box that is added at both ends of an axis with mass there
 
 
@@ -105,6 +108,11 @@ class Builder:
         """The accuracy of a cross interpolation: the errors of the cores add up."""
         return Options(CORES * self._tolerance, self.prepared.most_rank)
 
+    @property
+    def single(self) -> bool:
+        """Whether what is built is evaluated in single precision."""
+        return self.options.tolerance > SINGLE
+
     def build(
         self, function: Callable[[Array], Array], mass: Mass, noise: Array | None = None, stretch: float = 1.0, loose: float = 1.0
     ) -> tuple[Train, Array]:
@@ -161,14 +169,13 @@ class Builder:
         expected = function.terms[0].density.ranks if isinstance(function, Carried) else None
         points = control.points, control.moving
         built = cross(placed.grid, function, points, options, self.prepared.system.periods, expected)
-        self._edges = built.train.edges()
-        self.missed = Missed(control, relative_difference(built.train.evaluate, function, control))
-        error = self.missed.size
-        rank = max(built.train.ranks)
-        report = Report(
-            built.evaluations, built.sweeps, rank, built.error, error, float(self._edges.max(initial=0.0)), built.capped
-        )
-        return built.train, report
+        v, rank = built.train, max(built.train.ranks)
+        if rank > LARGE:
+            v = v.rounded(ROUNDING * options.tolerance)
+        self._edges = v.edges()
+        self.missed = Missed(control, relative_difference(v.evaluate, function, control))
+        edge = float(self._edges.max(initial=0.0))
+        return v, Report(built.evaluations, built.sweeps, rank, built.error, self.missed.size, edge, built.capped)
 
 
 def relative_difference(one: Callable[[Array], Array], other: Callable[[Array], Array], control: Mass) -> Array:

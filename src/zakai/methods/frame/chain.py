@@ -17,11 +17,11 @@ convolution with a diagonal noise, moments and marginals, weighted points of its
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from zakai.methods.frame.build import CLOUD, Builder
+from zakai.methods.frame.build import CLOUD, ROUNDING, Builder, relative_difference
 from zakai.methods.frame.errors import Missed
 from zakai.methods.frame.moves import Flow, Kick, Move, Noise, Shift
 from zakai.methods.frame.placement import Mass, closed_axes
@@ -38,7 +38,7 @@ DEFECT = 3.0  # tolerances of mass that a motion may lose or gain before its box
 LOST = 0.2  # mass that a chain of substeps may lose before it is divided
 MOST_SUBSTEPS = 128
 FAR = 1e100  # a state that has left every bounded set
-ROUNDING = 0.01  # share of the error of a cross interpolation that rounding after a convolution may add
+CHECKED = 512  # points at which a density is compared with the one before rounding
 ALONE = 1e-9  # off-diagonal noise in a frame that needs no correction
 
 
@@ -114,7 +114,7 @@ class Chain:
         back = motion.path(self.interval, t1, t0, self.values, steps)
         term = Term(u, np.array([1.0, top]), motion.backward, back)
         nothing = Likelihood(motion.coefficients.law, np.zeros(0), np.zeros(0), t1, 1.0, 0.0)
-        return Carried((term,), motion.box, np.full(u.grid.n, np.nan), nothing)
+        return Carried((term,), motion.box, np.full(u.grid.n, np.nan), nothing, self.builder.single)
 
     def _middle(self, u: Train, t0: float, t1: float, length: float) -> tuple[Train, float, float]:
         """Return the density after the flow from t0 to t1 and the noise about t1, the logarithm of its mass, and the defect."""
@@ -132,10 +132,10 @@ class Chain:
         self.halves[-1] = self.halves[-1]._replace(about=(mean, scale), choice=self.builder.choice(v))
         variances, turned = np.maximum(np.diag(D), 0.0), corrections(D)
         self.moves.append(Noise(v, variances, turned, self.builder.tails))
-        v = v.convolve(variances, ROUNDING * self.builder.options.tolerance)
+        v = v.convolve(variances)
         v = v.in_basis(np.ascontiguousarray(v.grid.basis @ turned))
         log_mass, defect = self._of_mass(function, total)
-        v = v.scaled(1.0 / total)
+        v = self._rounded(v.scaled(1.0 / total))
         for direction in directions:
             here, mass = self._standing(v, t1)
             spread, mass, shifts = shifted(here, mass, direction, self.builder.rule.width, t1)
@@ -145,6 +145,16 @@ class Chain:
             log_mass, defect, v = log_mass + gained, defect + lost, v.scaled(1.0 / total)
         return v, log_mass, defect
 
+    def _rounded(self, v: Train) -> Train:
+        """Return a density of mass one with smaller ranks; note what it then misses."""
+        found = v.rounded(ROUNDING * self.builder.options.tolerance)
+        if found is v:
+            return v
+        found = found.scaled(1.0 / found.mass)
+        mass = Mass(*Mass(*found.cloud(CLOUD)).part(CHECKED))
+        self.missed.append(Missed(mass, relative_difference(found.evaluate, v.evaluate, mass)))
+        return found
+
     def _standing(self, v: Train, t: float) -> tuple[Carried, Mass]:
         """Return a density as a function that no flow has moved, and points of it."""
         motion = self.prepared.motion
@@ -152,7 +162,7 @@ class Chain:
         nothing = Likelihood(motion.coefficients.law, np.zeros(0), np.zeros(0), t, 1.0, 0.0)
         term = Term(v, np.array([1.0, 0.0]), motion.backward, nowhere)
         mass = Mass(*v.cloud(CLOUD)).unwrapped(self.prepared.system.base.angles)
-        return Carried((term,), motion.box, np.full(v.grid.n, np.nan), nothing), mass
+        return Carried((term,), motion.box, np.full(v.grid.n, np.nan), nothing, self.builder.single), mass
 
     def _of_mass(self, function: Carried, total: float) -> tuple[float, float]:
         """Return the logarithm of the mass that a motion leaves, and the defect where it should be one."""
@@ -240,4 +250,4 @@ def extrapolated(finer: Prediction, coarser: Prediction) -> Carried:
     first = Term(one.density, np.array([4.0 / 3.0, one.scale[1]]), one.program, one.path)
     divisor = one.scale[1] - (coarser.log_mass - finer.log_mass)
     second = Term(other.density, np.array([-1.0 / 3.0, divisor]), other.program, other.path)
-    return Carried((first, second), finer.function.box, finer.function.turn, finer.function.likelihood)
+    return replace(finer.function, terms=(first, second))

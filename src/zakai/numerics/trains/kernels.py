@@ -29,9 +29,10 @@ PATH = types.Tuple((F2, F3))
 # each core; of the Gaussian that stands for the tails the mean less the centre, the inverse of a root of the covariance, and
 # [square of the radius where it begins, largest value, value at the radius].
 TRAIN = types.Tuple((F1, F2, F1, F1, I1, F1, I1, I1, F1, F1, F2, F1))
+SINGLE_TRAIN = types.Tuple((F1, F2, F1, F1, I1, F1, I1, I1, types.float32[::1], F1, F2, F1))  # coefficients of single precision
 # Ranks (n + 1,), sizes (n,), where each core begins (n,), and the cores in the order (N, a, b).
 PACKED = types.Tuple((I1, I1, I1, F1))
-POINTS, TOGETHER = 1024, 64  # of a block, which are sorted, and of one product of matrices
+POINTS, TOGETHER = 2048, 128  # of a block, which are sorted, and of one product of matrices
 LARGEST_LOG = 500.0  # of a factor; the exponential of more is cut
 # Later observations lead into what are tails now, where an error relative to the density becomes one of the mean.  With the power
 # 1/2 of the sums (the scaling of correspondence analysis) the error of a skeleton is relative to the density, as an average over
@@ -78,20 +79,20 @@ def flow(program: Any, box: Any, path: Any, x: Array, out: Array) -> None:
                     now[d, i] += total[d, i]
 
 
-@kernel(types.void(TRAIN, F2, types.boolean, F1, F1), reordered=True)
-def add_train(train: Any, x: Array, moved: bool, scale: Array, out: Array) -> None:
+def _add_train(train: Any, x: Array, moved: bool, scale: Array, out: Array) -> None:
     """Add the values of a train at points x (n, P) to `out` (P,).
 
     v <- sum_d w_d(z_k) v C_k[j + d] over the axes, times scale[0] and, if moved, exp(x[n] - scale[1]); a value that is not a
-    number counts as zero.  Points of a block are sorted by their cell j on each axis: those of a cell are a product of matrices.
+    number counts as zero.  Points of a block are sorted by their cell j on each axis: those of a cell are a product of matrices,
+    in the precision of the coefficients.
     """
     centre, inverse, low, step, sizes, periods, ranks, offsets, flat, mean, whitening, tail = train
-    n, count = low.size, x.shape[1]
+    n, count, tails = low.size, x.shape[1], tail[0] < math.inf
     width, cells = 0, 0
     for k in range(n):
         width, cells = max(width, ranks[k + 1]), max(cells, sizes[k] + 2 * PAD)
-    w, c, y, s = np.empty(6), np.empty(TOGETHER * 6 * width), np.empty(n), np.empty((n, POINTS))
-    v, after, gaussian = np.empty((POINTS, width)), np.empty(TOGETHER * width), np.empty(POINTS)
+    y, s, w, c = np.empty(n), np.empty((n, POINTS)), np.empty(6, flat.dtype), np.empty(TOGETHER * 6 * width, flat.dtype)
+    v, after, gaussian = np.empty((POINTS, width), flat.dtype), np.empty(TOGETHER * width, flat.dtype), np.empty(POINTS)
     inside, alive, cell = np.empty(POINTS, np.bool_), np.empty(POINTS, np.int64), np.empty(POINTS, np.int64)
     starts, order = np.empty(cells + 1, np.int64), np.empty(POINTS, np.int64)
     for first in range(0, count, POINTS):
@@ -103,13 +104,16 @@ def add_train(train: Any, x: Array, moved: bool, scale: Array, out: Array) -> No
                     y[d] -= periods[d] * math.floor(y[d] / periods[d] + 0.5)
             within, square = True, 0.0
             for k in range(n):
-                z, white = 0.0, 0.0
+                z = -low[k]
                 for d in range(n):
                     z += inverse[k, d] * y[d]
-                    white += whitening[k, d] * (y[d] - mean[d])
-                s[k, p] = (z - low[k]) / step[k]
+                s[k, p] = z / step[k]
                 within = within and s[k, p] > -2.9 and s[k, p] < sizes[k] + 1.9
-                square += white * white
+                if tails:
+                    white = 0.0
+                    for d in range(n):
+                        white += whitening[k, d] * (y[d] - mean[d])
+                    square += white * white
             inside[p] = within or square > tail[0]
             v[p, 0] = 1.0 if within else 0.0
             gaussian[p] = tail[1] * math.exp(-0.5 * square) if square > tail[0] else -1.0
@@ -147,7 +151,7 @@ def add_train(train: Any, x: Array, moved: bool, scale: Array, out: Array) -> No
                 begin = end
         for p in range(size):
             if inside[p]:
-                value = v[p, 0]
+                value = float(v[p, 0])
                 if gaussian[p] >= 0.0:  # the train from twice the value at the radius, the Gaussian below it, smoothly in between
                     share = min(max(value / tail[2] - 1.0, 0.0), 1.0)
                     share *= share * (3.0 - 2.0 * share)
@@ -157,6 +161,10 @@ def add_train(train: Any, x: Array, moved: bool, scale: Array, out: Array) -> No
                     value *= math.exp(min(x[n, first + p] - scale[1], LARGEST_LOG))
                 if value == value:
                     out[first + p] += value
+
+
+_SIGNATURES = [types.void(arrays, F2, types.boolean, F1, F1) for arrays in (TRAIN, SINGLE_TRAIN)]
+add_train, add_single = (kernel(signature, reordered=True)(_add_train) for signature in _SIGNATURES)
 
 
 @kernel(types.void(F2, F1, BOX, F1, F2, F1))
