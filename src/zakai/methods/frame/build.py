@@ -170,7 +170,7 @@ class Builder:
         points = control.points, control.moving
         built = cross(placed.grid, function, points, options, self.prepared.system.periods, expected)
         v, rank = built.train, max(built.train.ranks)
-        if rank > LARGE:
+        if rank > LARGE and not placed.noise.any():  # else the density is convolved, and rounded then
             v = v.rounded(ROUNDING * options.tolerance)
         self._edges = v.edges()
         self.missed = Missed(control, relative_difference(v.evaluate, function, control))

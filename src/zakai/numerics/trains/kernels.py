@@ -91,33 +91,38 @@ def _add_train(train: Any, x: Array, moved: bool, scale: Array, out: Array) -> N
     width, cells = 0, 0
     for k in range(n):
         width, cells = max(width, ranks[k + 1]), max(cells, sizes[k] + 2 * PAD)
-    y, s, w, c = np.empty(n), np.empty((n, POINTS)), np.empty(6, flat.dtype), np.empty(TOGETHER * 6 * width, flat.dtype)
-    v, after, gaussian = np.empty((POINTS, width), flat.dtype), np.empty(TOGETHER * width, flat.dtype), np.empty(POINTS)
-    inside, alive, cell = np.empty(POINTS, np.bool_), np.empty(POINTS, np.int64), np.empty(POINTS, np.int64)
+    y, s, square, inside = np.empty((n, POINTS)), np.empty((n, POINTS)), np.empty(POINTS), np.empty(POINTS, np.bool_)
+    w, c, after = np.empty(6, flat.dtype), np.empty(TOGETHER * 6 * width, flat.dtype), np.empty(TOGETHER * width, flat.dtype)
+    v, alive, cell = np.empty((POINTS, width), flat.dtype), np.empty(POINTS, np.int64), np.empty(POINTS, np.int64)
     starts, order = np.empty(cells + 1, np.int64), np.empty(POINTS, np.int64)
     for first in range(0, count, POINTS):
         size, used = min(POINTS, count - first), 0
-        for p in range(size):
+        for d in range(n):
+            for p in range(size):
+                y[d, p] = x[d, first + p] - centre[d]
+            if periods[d] > 0.0:
+                for p in range(size):
+                    y[d, p] -= periods[d] * math.floor(y[d, p] / periods[d] + 0.5)
+        inside[:size], square[:size] = True, 0.0
+        for k in range(n):
+            here, top = s[k], sizes[k] + 1.9
+            here[:size] = -low[k] / step[k]
             for d in range(n):
-                y[d] = x[d, first + p] - centre[d]
-                if periods[d] > 0.0:
-                    y[d] -= periods[d] * math.floor(y[d] / periods[d] + 0.5)
-            within, square = True, 0.0
-            for k in range(n):
-                z = -low[k]
-                for d in range(n):
-                    z += inverse[k, d] * y[d]
-                s[k, p] = z / step[k]
-                within = within and s[k, p] > -2.9 and s[k, p] < sizes[k] + 1.9
-                if tails:
+                factor, other = inverse[k, d] / step[k], y[d]
+                if factor != 0.0:
+                    for p in range(size):
+                        here[p] += factor * other[p]
+            for p in range(size):
+                inside[p] = inside[p] and here[p] > -2.9 and here[p] < top
+            if tails:
+                for p in range(size):
                     white = 0.0
                     for d in range(n):
-                        white += whitening[k, d] * (y[d] - mean[d])
-                    square += white * white
-            inside[p] = within or square > tail[0]
-            v[p, 0] = 1.0 if within else 0.0
-            gaussian[p] = tail[1] * math.exp(-0.5 * square) if square > tail[0] else -1.0
-            if within:
+                        white += whitening[k, d] * (y[d, p] - mean[d])
+                    square[p] += white * white
+        for p in range(size):
+            v[p, 0] = 1.0 if inside[p] else 0.0
+            if inside[p]:
                 alive[used] = p
                 used += 1
         for k in range(n):
@@ -150,12 +155,13 @@ def _add_train(train: Any, x: Array, moved: bool, scale: Array, out: Array) -> N
                         v[order[begin + i], q] = after[i * b + q]
                 begin = end
         for p in range(size):
-            if inside[p]:
+            far = square[p] > tail[0]
+            if inside[p] or far:
                 value = float(v[p, 0])
-                if gaussian[p] >= 0.0:  # the train from twice the value at the radius, the Gaussian below it, smoothly in between
+                if far:  # the train from twice the value at the radius, the Gaussian below it, smoothly in between
                     share = min(max(value / tail[2] - 1.0, 0.0), 1.0)
                     share *= share * (3.0 - 2.0 * share)
-                    value = share * value + (1.0 - share) * gaussian[p]
+                    value = share * value + (1.0 - share) * tail[1] * math.exp(-0.5 * square[p])
                 value *= scale[0]
                 if moved:
                     value *= math.exp(min(x[n, first + p] - scale[1], LARGEST_LOG))
