@@ -331,7 +331,7 @@ def draw(packed: Any, right: Array, share: Array, flat: bool, out: Array) -> Non
 
     Args:
         packed: a train.
-        right: its cores times the sums over all axes to the right (N, a), one after the other.
+        right: its cores times the sums over all axes to the right (a, N), one after the other.
         share: uniform numbers (n, P).
         flat: each conditional law is drawn in proportion to its square root.
         out: receives positions in units of the spacing (n, P), the probability of the cell, and that of having been drawn by the
@@ -349,12 +349,15 @@ def draw(packed: Any, right: Array, share: Array, flat: bool, out: Array) -> Non
         for k in range(n):
             a, b, N = ranks[k], ranks[k + 1], sizes[k]
             total, root_total = 0.0, 0.0
+            w[:N] = 0.0
+            for q in range(a):
+                factor, row = v[q], right[at_right + q * N : at_right + (q + 1) * N]
+                for i in range(N):
+                    w[i] += factor * row[i]
             for i in range(N):
-                t = 0.0
-                for q in range(a):
-                    t += v[q] * right[at_right + i * a + q]
-                w[i] = max(t, 0.0)
+                w[i] = max(w[i], 0.0)
                 root[i] = math.sqrt(w[i])
+            for i in range(N):
                 total += w[i]
                 root_total += root[i]
             at_right += N * a

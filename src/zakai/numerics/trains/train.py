@@ -190,7 +190,7 @@ class Train:
         """Return draws x (n, P) by uniform numbers (n, P), and their probabilities in both laws of `draw` (2, P)."""
         n = self.grid.n
         out, right = np.empty((n + 2, share.shape[1])), self._sums[1]
-        rest = np.concatenate([(core @ after[:, 0]).T.ravel() for core, after in zip(self.cores, right[1:], strict=True)])
+        rest = np.concatenate([(core @ after[:, 0]).ravel() for core, after in zip(self.cores, right[1:], strict=True)])
         draw(self._packed, rest, share, flat, out)
         z = self.grid.low[:, None] + self.grid.step[:, None] * out[:n]
         return self.grid.x_of(z), out[n:]
