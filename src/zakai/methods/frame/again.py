@@ -66,7 +66,7 @@ def _predicted(chain: Chain, u: Train, halves: tuple[Half, ...]) -> Prediction:
             log_mass += math.log(total) + half.top
         Q, _ = prepared.motion.noise(interval, chain.values, middle, length, half.about)
         D = _in_frame(Q, v)
-        v = v.convolve(np.maximum(np.diag(D), 0.0)).rounded(FINER * FINER * half.choice.options.tolerance)
+        v = v.convolve(np.maximum(np.diag(D), 0.0), FINER * FINER * half.choice.options.tolerance)
         u, at = v.in_basis(np.ascontiguousarray(v.grid.basis @ corrections(D))).scaled(1.0 / total), middle
     function = chain.carried(u, (at, interval.stop), halves[-1].steps, halves[-1].top)
     n = prepared.model.n

@@ -23,8 +23,6 @@ CLOUD = 1024
 # chosen, the largest error of a mean without a warning is 1.7 tolerances (2e-2), 4.4 with .6 and .25: errors in tails become
 # those of a mean where later observations lead there.
 SHARE, CORES = 0.4, 0.2
-# Share of the error of a core that rounding may add, and the rank above which that takes less time than evaluations save.
-ROUNDING, LARGE = 0.3, 8
 LEAST = 0.6  # of the tolerance that earlier errors may leave
 EDGE = 0.3  # share of the tolerance that may be near an end of an axis
 ROUGH = 4.0  # tolerances of error off the grid, above which the grid is made finer
@@ -169,13 +167,10 @@ class Builder:
         expected = function.terms[0].density.ranks if isinstance(function, Carried) else None
         points = control.points, control.moving
         built = cross(placed.grid, function, points, options, self.prepared.system.periods, expected)
-        v, rank = built.train, max(built.train.ranks)
-        if rank > LARGE and not placed.noise.any():  # else the density is convolved, and rounded then
-            v = v.rounded(ROUNDING * options.tolerance)
-        self._edges = v.edges()
+        v, self._edges = built.train, built.train.edges()
         self.missed = Missed(control, relative_difference(v.evaluate, function, control))
         edge = float(self._edges.max(initial=0.0))
-        return v, Report(built.evaluations, built.sweeps, rank, built.error, self.missed.size, edge, built.capped)
+        return v, Report(built.evaluations, built.sweeps, max(v.ranks), built.error, self.missed.size, edge, built.capped)
 
 
 def relative_difference(one: Callable[[Array], Array], other: Callable[[Array], Array], control: Mass) -> Array:

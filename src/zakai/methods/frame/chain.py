@@ -21,7 +21,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from zakai.methods.frame.build import CLOUD, ROUNDING, Builder, relative_difference
+from zakai.methods.frame.build import CLOUD, Builder
 from zakai.methods.frame.errors import Missed
 from zakai.methods.frame.moves import Flow, Kick, Move, Noise, Shift
 from zakai.methods.frame.placement import Mass, closed_axes
@@ -38,7 +38,9 @@ DEFECT = 3.0  # tolerances of mass that a motion may lose or gain before its box
 LOST = 0.2  # mass that a chain of substeps may lose before it is divided
 MOST_SUBSTEPS = 128
 FAR = 1e100  # a state that has left every bounded set
-CHECKED = 512  # points at which a density is compared with the one before rounding
+# Share of the error of a core that rounding after a convolution may add.  It leaves out what is small beside the largest values: with
+# .3, which takes a fifth less time, a robot's mean is off by 13 tolerances after observations that lead into a tail, without by 3.
+ROUNDING = 0.01
 ALONE = 1e-9  # off-diagonal noise in a frame that needs no correction
 
 
@@ -132,10 +134,10 @@ class Chain:
         self.halves[-1] = self.halves[-1]._replace(about=(mean, scale), choice=self.builder.choice(v))
         variances, turned = np.maximum(np.diag(D), 0.0), corrections(D)
         self.moves.append(Noise(v, variances, turned, self.builder.tails))
-        v = v.convolve(variances)
+        v = v.convolve(variances, ROUNDING * self.builder.options.tolerance)
         v = v.in_basis(np.ascontiguousarray(v.grid.basis @ turned))
         log_mass, defect = self._of_mass(function, total)
-        v = self._rounded(v.scaled(1.0 / total))
+        v = v.scaled(1.0 / total)
         for direction in directions:
             here, mass = self._standing(v, t1)
             spread, mass, shifts = shifted(here, mass, direction, self.builder.rule.width, t1)
@@ -144,16 +146,6 @@ class Chain:
             gained, lost = self._of_mass(spread, total)
             log_mass, defect, v = log_mass + gained, defect + lost, v.scaled(1.0 / total)
         return v, log_mass, defect
-
-    def _rounded(self, v: Train) -> Train:
-        """Return a density of mass one with smaller ranks; note what it then misses."""
-        found = v.rounded(ROUNDING * self.builder.options.tolerance)
-        if found is v:
-            return v
-        found = found.scaled(1.0 / found.mass)
-        mass = Mass(*Mass(*found.cloud(CLOUD)).part(CHECKED))
-        self.missed.append(Missed(mass, relative_difference(found.evaluate, v.evaluate, mass)))
-        return found
 
     def _standing(self, v: Train, t: float) -> tuple[Carried, Mass]:
         """Return a density as a function that no flow has moved, and points of it."""

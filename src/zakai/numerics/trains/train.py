@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import Any
 
@@ -250,19 +250,14 @@ class Train:
         """Return the train with another basis of its frame."""
         return Train(self.grid._replace(basis=basis), self.cores, self.periods)
 
-    def rounded(self, tolerance: float) -> Train:
-        """Return the train with the fewest ranks within a relative error in the Frobenius norm; itself where none is smaller."""
-        cores = rounded(self.cores, tolerance)
-        return self if [core.shape for core in cores] == [core.shape for core in self.cores] else replace(self, cores=cores)
-
-    def convolve(self, variances: Array) -> Train:
-        """Return the convolution with N(0, diag(variances)) in z, on the grid that it needs."""
+    def convolve(self, variances: Array, tolerance: float) -> Train:
+        """Return the convolution with N(0, diag(variances)) in z, on the grid that it needs, rounded to a relative error."""
         target, cores = after_noise(self.grid, variances), list[Array]()
         for k, core in enumerate(self.cores):
             if variances[k] > SMALL:
                 core = kernel_matrix(self.grid, k, variances[k], target) @ core
             cores.append(core)
-        return Train(target, tuple(cores), self.periods)
+        return Train(target, rounded(cores, tolerance), self.periods)
 
 
 def _wrapped_powers(angle: Array) -> tuple[Array, Array]:
