@@ -38,8 +38,8 @@ DEFECT = 3.0  # tolerances of mass that a motion may lose or gain before its box
 LOST = 0.2  # mass that a chain of substeps may lose before it is divided
 MOST_SUBSTEPS = 128
 FAR = 1e100  # a state that has left every bounded set
-# Share of the error of a core that rounding after a convolution may add.  It leaves out what is small beside the largest values: with
-# .3, which takes a fifth less time, a robot's mean is off by 13 tolerances after observations that lead into a tail, without by 3.
+# Share of the error of a core that rounding after a convolution may add.  Rounding leaves out what is small beside the largest
+# values: with .3, in a fifth less time, a robot's mean is off by 13 tolerances after observations in a tail, without by 3.
 ROUNDING = 0.01
 ALONE = 1e-9  # off-diagonal noise in a frame that needs no correction
 
