@@ -33,7 +33,6 @@ LOOSEST = 0.1
 # deviations away from a linear track has an error of .1 to 4 tolerances with shares from .1 to 1e-3; in the tails of a density
 # that is not Gaussian (an angle whose noise depends on its rate) one has an error of .016 deviations with .1, .003 with 1e-3.
 TAILS = 1e-3
-SINGLE = 1e-4  # tolerance of a core down to which densities have single precision: errors of 1e-6, in tails less
 WIDER = 0.25  # share of a box that is added at both ends of an axis with mass there
 
 
@@ -105,11 +104,6 @@ class Builder:
     def options(self) -> Options:
         """The accuracy of a cross interpolation: the errors of the cores add up."""
         return Options(CORES * self._tolerance, self.prepared.most_rank)
-
-    @property
-    def single(self) -> bool:
-        """Whether what is built is evaluated in single precision."""
-        return self.options.tolerance > SINGLE
 
     def build(
         self, function: Callable[[Array], Array], mass: Mass, noise: Array | None = None, stretch: float = 1.0, loose: float = 1.0

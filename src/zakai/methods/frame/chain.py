@@ -116,7 +116,7 @@ class Chain:
         back = motion.path(self.interval, t1, t0, self.values, steps)
         term = Term(u, np.array([1.0, top]), motion.backward, back)
         nothing = Likelihood(motion.coefficients.law, np.zeros(0), np.zeros(0), t1, 1.0, 0.0)
-        return Carried((term,), motion.box, np.full(u.grid.n, np.nan), nothing, self.builder.single)
+        return Carried((term,), motion.box, np.full(u.grid.n, np.nan), nothing)
 
     def _middle(self, u: Train, t0: float, t1: float, length: float) -> tuple[Train, float, float]:
         """Return the density after the flow from t0 to t1 and the noise about t1, the logarithm of its mass, and the defect."""
@@ -154,7 +154,7 @@ class Chain:
         nothing = Likelihood(motion.coefficients.law, np.zeros(0), np.zeros(0), t, 1.0, 0.0)
         term = Term(v, np.array([1.0, 0.0]), motion.backward, nowhere)
         mass = Mass(*v.cloud(CLOUD)).unwrapped(self.prepared.system.base.angles)
-        return Carried((term,), motion.box, np.full(v.grid.n, np.nan), nothing, self.builder.single), mass
+        return Carried((term,), motion.box, np.full(v.grid.n, np.nan), nothing), mass
 
     def _of_mass(self, function: Carried, total: float) -> tuple[float, float]:
         """Return the logarithm of the mass that a motion leaves, and the defect where it should be one."""

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from zakai.numerics.particles.formulas import evaluate
-from zakai.numerics.trains.kernels import add_single, add_train, flow, weigh
+from zakai.numerics.trains.kernels import add_train, flow, weigh
 from zakai.numerics.trains.train import Train
 
 Array = Any
@@ -47,16 +47,12 @@ class Term(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Carried:
-    """The sum of some terms, times a likelihood; zero outside of `box` and beyond half a turn from `turn` (n,).
-
-    In `single` precision the values of the densities have an error of about 1e-6 of the largest, less in tails.
-    """
+    """The sum of some terms, times a likelihood; zero outside of `box` and beyond half a turn from `turn` (n,)."""
 
     terms: tuple[Term, ...]
     box: tuple[Array, Array]
     turn: Array
     likelihood: Likelihood
-    single: bool = False
 
     def __call__(self, x: Array) -> Array:
         """Return the values (P,) at points x (n, P)."""
@@ -66,10 +62,7 @@ class Carried:
             if moved:
                 ends = np.empty((len(x) + 1, x.shape[1]))
                 flow(term.program, self.box, (term.path.times, term.path.given), x, ends)
-            if self.single:
-                add_single(term.density.single_arrays, ends, moved, term.scale, out)
-            else:
-                add_train(term.density.arrays, ends, moved, term.scale, out)
+            add_train(term.density.arrays, ends, moved, term.scale, out)
         law, logs = self.likelihood, np.empty((0, len(out)))
         used = law.counted > 0
         if used.any():

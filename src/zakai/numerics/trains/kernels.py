@@ -29,7 +29,6 @@ PATH = types.Tuple((F2, F3))
 # each core; of the Gaussian that stands for the tails the mean less the centre, the inverse of a root of the covariance, and
 # [square of the radius where it begins, largest value, value at the radius].
 TRAIN = types.Tuple((F1, F2, F1, F1, I1, F1, I1, I1, F1, F1, F2, F1))
-SINGLE_TRAIN = types.Tuple((F1, F2, F1, F1, I1, F1, I1, I1, types.float32[::1], F1, F2, F1))  # coefficients of single precision
 # Ranks (n + 1,), sizes (n,), where each core begins (n,), and the cores in the order (N, a, b).
 PACKED = types.Tuple((I1, I1, I1, F1))
 POINTS, TOGETHER = 2048, 128  # of a block, which are sorted, and of one product of matrices
@@ -79,12 +78,12 @@ def flow(program: Any, box: Any, path: Any, x: Array, out: Array) -> None:
                     now[d, i] += total[d, i]
 
 
-def _add_train(train: Any, x: Array, moved: bool, scale: Array, out: Array) -> None:
+@kernel(types.void(TRAIN, F2, types.boolean, F1, F1), reordered=True)
+def add_train(train: Any, x: Array, moved: bool, scale: Array, out: Array) -> None:
     """Add the values of a train at points x (n, P) to `out` (P,).
 
     v <- sum_d w_d(z_k) v C_k[j + d] over the axes, times scale[0] and, if moved, exp(x[n] - scale[1]); a value that is not a
-    number counts as zero.  Points of a block are sorted by their cell j on each axis: those of a cell are a product of matrices,
-    in the precision of the coefficients.
+    number counts as zero.  Points of a block are sorted by their cell j on each axis: those of a cell are a product of matrices.
     """
     centre, inverse, low, step, sizes, periods, ranks, offsets, flat, mean, whitening, tail = train
     n, count, tails = low.size, x.shape[1], tail[0] < math.inf
@@ -92,8 +91,8 @@ def _add_train(train: Any, x: Array, moved: bool, scale: Array, out: Array) -> N
     for k in range(n):
         width, cells = max(width, ranks[k + 1]), max(cells, sizes[k] + 2 * PAD)
     y, s, square, inside = np.empty((n, POINTS)), np.empty((n, POINTS)), np.empty(POINTS), np.empty(POINTS, np.bool_)
-    w, c, after = np.empty(6, flat.dtype), np.empty(TOGETHER * 6 * width, flat.dtype), np.empty(TOGETHER * width, flat.dtype)
-    v, alive, cell = np.empty((POINTS, width), flat.dtype), np.empty(POINTS, np.int64), np.empty(POINTS, np.int64)
+    w, c, after = np.empty(6), np.empty(TOGETHER * 6 * width), np.empty(TOGETHER * width)
+    v, alive, cell = np.empty((POINTS, width)), np.empty(POINTS, np.int64), np.empty(POINTS, np.int64)
     starts, order = np.empty(cells + 1, np.int64), np.empty(POINTS, np.int64)
     for first in range(0, count, POINTS):
         size, used = min(POINTS, count - first), 0
@@ -157,7 +156,7 @@ def _add_train(train: Any, x: Array, moved: bool, scale: Array, out: Array) -> N
         for p in range(size):
             far = square[p] > tail[0]
             if inside[p] or far:
-                value = float(v[p, 0])
+                value = v[p, 0]
                 if far:  # the train from twice the value at the radius, the Gaussian below it, smoothly in between
                     share = min(max(value / tail[2] - 1.0, 0.0), 1.0)
                     share *= share * (3.0 - 2.0 * share)
@@ -167,10 +166,6 @@ def _add_train(train: Any, x: Array, moved: bool, scale: Array, out: Array) -> N
                     value *= math.exp(min(x[n, first + p] - scale[1], LARGEST_LOG))
                 if value == value:
                     out[first + p] += value
-
-
-_SIGNATURES = [types.void(arrays, F2, types.boolean, F1, F1) for arrays in (TRAIN, SINGLE_TRAIN)]
-add_train, add_single = (kernel(signature, reordered=True)(_add_train) for signature in _SIGNATURES)
 
 
 @kernel(types.void(F2, F1, BOX, F1, F2, F1))

@@ -65,11 +65,6 @@ class Train:
         )  # fmt: skip
 
     @cached_property
-    def single_arrays(self) -> tuple[Any, ...]:
-        """The train as `add_single` takes it, with coefficients of single precision."""
-        return (*self.arrays[:8], self.arrays[8].astype(np.float32), *self.arrays[9:])
-
-    @cached_property
     def _tail(self) -> tuple[Array, Array, Array]:
         """The Gaussian with the moments of the train that stands for it where it is below its accuracy."""
         n, mass = self.grid.n, self.mass
