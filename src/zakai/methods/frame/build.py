@@ -161,14 +161,10 @@ class Builder:
         expected = function.terms[0].density.ranks if isinstance(function, Carried) else None
         points = control.points, control.moving
         built = cross(placed.grid, function, points, options, self.prepared.system.periods, expected)
-        self._edges = built.train.edges()
-        self.missed = Missed(control, relative_difference(built.train.evaluate, function, control))
-        error = self.missed.size
-        rank = max(built.train.ranks)
-        report = Report(
-            built.evaluations, built.sweeps, rank, built.error, error, float(self._edges.max(initial=0.0)), built.capped
-        )
-        return built.train, report
+        v, self._edges = built.train, built.train.edges()
+        self.missed = Missed(control, relative_difference(v.evaluate, function, control))
+        edge = float(self._edges.max(initial=0.0))
+        return v, Report(built.evaluations, built.sweeps, max(v.ranks), built.error, self.missed.size, edge, built.capped)
 
 
 def relative_difference(one: Callable[[Array], Array], other: Callable[[Array], Array], control: Mass) -> Array:

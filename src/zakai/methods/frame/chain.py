@@ -17,7 +17,7 @@ convolution with a diagonal noise, moments and marginals, weighted points of its
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -38,7 +38,9 @@ DEFECT = 3.0  # tolerances of mass that a motion may lose or gain before its box
 LOST = 0.2  # mass that a chain of substeps may lose before it is divided
 MOST_SUBSTEPS = 128
 FAR = 1e100  # a state that has left every bounded set
-ROUNDING = 0.01  # share of the error of a cross interpolation that rounding after a convolution may add
+# Share of the error of a core that rounding after a convolution may add.  Rounding leaves out what is small beside the largest
+# values: with .3, in a fifth less time, a robot's mean is off by 13 tolerances after observations in a tail, without by 3.
+ROUNDING = 0.01
 ALONE = 1e-9  # off-diagonal noise in a frame that needs no correction
 
 
@@ -240,4 +242,4 @@ def extrapolated(finer: Prediction, coarser: Prediction) -> Carried:
     first = Term(one.density, np.array([4.0 / 3.0, one.scale[1]]), one.program, one.path)
     divisor = one.scale[1] - (coarser.log_mass - finer.log_mass)
     second = Term(other.density, np.array([-1.0 / 3.0, divisor]), other.program, other.path)
-    return Carried((first, second), finer.function.box, finer.function.turn, finer.function.likelihood)
+    return replace(finer.function, terms=(first, second))

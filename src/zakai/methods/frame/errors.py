@@ -16,8 +16,10 @@ fifth for a state after a long gap.
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -72,11 +74,11 @@ class Error(NamedTuple):
         return cls(first, moved @ z.T - shares.sum() * one, _certain(third, float(shares**2 @ sizes)), moved @ moved.T)
 
     @classmethod
-    def between(cls, parts: Array, n: int) -> Error:
-        """Return the error of which groups of points have parts, the sums of `hermite` times their shares (n + n^2 + n^3, P)."""
-        total = parts.sum(axis=1)
-        third = _certain(total[n + n * n :].reshape(n, n, n), float((parts[n + n * n :] ** 2).sum()))
-        return cls(total[:n], total[n : n + n * n].reshape(n, n), third, np.zeros((n, n)))
+    def between(cls, total: Array, chance: Array, n: int) -> Error:
+        """Return the error of sums of `hermite` times shares of points (H,), and of what chance adds to their squares (H,)."""
+        known = monomials(n)
+        third = _certain(total[known.triples], float(chance[known.triples].sum()))
+        return cls(total[:n], total[known.pairs], third, np.zeros((n, n)))
 
     def plus(self, other: Error, factor: float = 1.0) -> Error:
         """Return the sum with an error times a factor; what chance adds is independent."""
@@ -95,7 +97,7 @@ class Error(NamedTuple):
         """Return the same function where an observation has moved the mean to z = shift, with the covariance B B'."""
         second = self.second + self.third @ shift
         change = np.outer(shift, shift) + B @ B.T - np.eye(len(shift))
-        first = self.first + self.second @ shift + 0.5 * np.einsum("ijk,jk->i", self.third, change)
+        first = self.first + self.second @ shift + 0.5 * self.third.reshape(len(shift), -1) @ change.ravel()
         return Error(B.T @ first, B.T @ second @ B, _turned(self.third, B.T), B.T @ self.spread @ B)
 
     def in_deviations(self, root: Array) -> float:
@@ -151,19 +153,42 @@ class Missed:
         return found.scaled(min(1.0, most / max(size, 1e-300)))
 
 
+class Monomials(NamedTuple):
+    """The monomials of degrees one to three, without permutations: how many there are of degrees one and two, and their numbers.
+
+    `recurrence` has for each of degree two and three the number of that without its last index, the last index, and those that
+    are subtracted (-1 is the constant one); `pairs` (n, n) and `triples` (n, n, n) are the numbers for all orders of indices.
+    """
+
+    low: int
+    recurrence: tuple[tuple[int, int, tuple[int, ...]], ...]
+    pairs: Array
+    triples: Array
+
+
+@lru_cache(maxsize=8)
+def monomials(n: int) -> Monomials:
+    """Return the monomials of n variables."""
+    found = [index for degree in range(4) for index in itertools.combinations_with_replacement(range(n), degree)]
+    number = {index: i - 1 for i, index in enumerate(found)}
+    recurrence = tuple(
+        (number[first], last, tuple(number[first[:i] + first[i + 1 :]] for i, other in enumerate(first) if other == last))
+        for *first_indices, last in found[n + 1 :]
+        for first in [tuple(first_indices)]
+    )
+    pairs, triples = (np.array([number[tuple(sorted(i))] for i in np.ndindex(*[n] * k)]).reshape([n] * k) for k in (2, 3))
+    return Monomials(n + n * (n + 1) // 2, recurrence, pairs, triples)
+
+
 def hermite(z: Array) -> Array:
-    """Return the Hermite polynomials of degrees one, two and three of points z (n, P), one after the other (n + n^2 + n^3, P)."""
-    n = len(z)
-    out = np.empty((n + n * n + n**3, z.shape[1]))
-    first, second, third = out[:n], out[n : n + n * n].reshape(n, n, -1), out[n + n * n :].reshape(n, n, n, -1)
-    first[:] = z
-    np.multiply(z[:, None], z, out=second)
-    np.multiply(second[:, :, None], z, out=third)
-    for i in range(n):
-        second[i, i] -= 1.0
-        third[i, i] -= z
-        third[i, :, i] -= z
-        third[:, i, i] -= z
+    """Return the Hermite polynomials of degrees one to three of points z (n, P), for all `monomials` (H, P)."""
+    n, recurrence = len(z), monomials(len(z)).recurrence
+    out = np.empty((n + len(recurrence), z.shape[1]))
+    out[:n] = z
+    for row, (before, last, subtracted) in enumerate(recurrence, n):
+        np.multiply(out[before], z[last], out=out[row])
+        for other in subtracted:
+            out[row] -= 1.0 if other < 0 else out[other]
     return out
 
 
@@ -180,7 +205,8 @@ def _certain(third: Array, chance: float) -> Array:
 
 def _turned(third: Array, A: Array) -> Array:
     """Return third derivatives (n, n, n) along other axes: the rows of a matrix (n, n)."""
-    return np.asarray(np.einsum("ai,bj,ck,ijk->abc", A, A, A, third, optimize=True))
+    n = len(A)
+    return np.asarray(A @ (A @ third.reshape(n, -1)).reshape(n, n, n) @ A.T)
 
 
 def root_of(P: Array) -> Array:

@@ -51,6 +51,13 @@ class Mass:
         apart = self.points - mean[:, None]
         return mean, (apart * self.weights) @ apart.T
 
+    def part(self, count: int) -> tuple[Array, Array]:
+        """Return an even number of points of a cloud, and their weights: the first ones of both of its halves."""
+        chosen = np.arange(count // 2)
+        chosen = np.concatenate([chosen, chosen + len(self.weights) // 2])
+        weights = self.weights[chosen]
+        return np.ascontiguousarray(self.points[:, chosen]), weights / weights.sum()
+
     def slope(self, ends: Array) -> Array:
         """Return the matrix (n, n) of the linear regression of other points (n, P), with the same weights, on these."""
         mean, P = self.moments()
@@ -113,7 +120,7 @@ class Mass:
         scale = np.maximum(np.sqrt(np.diag(P)), 1e-300)
         apart = (self.points - mean[:, None]) / scale[:, None]
         unit = P / np.outer(scale, scale) + 1e-9 * np.eye(len(P))
-        return np.asarray(np.sqrt(np.sum(apart * np.linalg.solve(unit, apart), axis=0) / len(P)))
+        return np.asarray(np.sqrt(np.sum(apart * (np.linalg.inv(unit) @ apart), axis=0) / len(P)))
 
     @cached_property
     def moving(self) -> Array:
@@ -226,7 +233,7 @@ def place(
         found = frame_of(P[block], None if noise is None else noise[block], together)
         B[np.ix_(free, free)] = 0.0
         B[np.ix_(rows, free)], D[np.ix_(free, free)] = found
-    z = np.linalg.solve(B, mass.points - mean[:, None])
+    z = np.linalg.inv(B) @ (mass.points - mean[:, None])
     heavy = z[:, mass.heavy(rule.tolerance)]
     low = -stretch * np.maximum(rule.width, -REACH * heavy.min(axis=1))
     high = stretch * np.maximum(rule.width, REACH * heavy.max(axis=1))

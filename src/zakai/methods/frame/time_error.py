@@ -20,7 +20,7 @@ from typing import NamedTuple
 import numpy as np
 
 from zakai.methods.frame.chain import Chain
-from zakai.methods.frame.errors import Error, hermite, root_of
+from zakai.methods.frame.errors import Error, hermite, monomials, root_of
 from zakai.methods.frame.placement import Mass
 from zakai.methods.particles.programs import Array
 from zakai.numerics.trains.carried import Likelihood
@@ -70,8 +70,8 @@ def measured(chain: Chain, u: Train, count: int, likelihood: Likelihood) -> Time
     square[n:] *= 0.5
     if not np.isfinite(square).all():
         return None
-    largest = float(square[: n + n * n].max())
-    return TimeError(count, math.sqrt(largest), Error.between(parts, n))
+    largest = float(square[: monomials(n).low].max())
+    return TimeError(count, math.sqrt(largest), Error.between(change, random, n))
 
 
 @dataclass(frozen=True)

@@ -119,7 +119,7 @@ def _in_frame(v: Train) -> tuple[Array, Array]:
 
 def depth_of(u: Carried, mass: Mass, posterior: Train, tolerance: float) -> float:
     """Return log(max u / u) where the posterior is, of a prediction known to a share of max u; zero for equal Gaussians."""
-    points, weights = posterior.cloud(DEPTH_POINTS)
+    points, weights = Mass(*posterior.cloud(CLOUD)).part(DEPTH_POINTS)
     values = u(np.concatenate([points, mass.points[:, ::APART]], axis=1))
     values = np.where(values > 0, values, tolerance * values.max())  # no more is known of it where it is not positive
-    return float(math.log(values.max()) - weights @ np.log(values[:DEPTH_POINTS]) - 0.5 * len(points))
+    return float(math.log(values.max()) - weights @ np.log(values[: len(weights)]) - 0.5 * len(points))

@@ -58,12 +58,11 @@ class Carried:
         """Return the values (P,) at points x (n, P)."""
         x, out = np.ascontiguousarray(x), np.zeros(x.shape[1])
         for term in self.terms:
-            if len(term.path.times):
+            ends, moved = x, len(term.path.times) > 0
+            if moved:
                 ends = np.empty((len(x) + 1, x.shape[1]))
                 flow(term.program, self.box, (term.path.times, term.path.given), x, ends)
-                add_train(term.density.arrays, ends, True, term.scale, out)
-            else:
-                add_train(term.density.arrays, x, False, term.scale, out)
+            add_train(term.density.arrays, ends, moved, term.scale, out)
         law, logs = self.likelihood, np.empty((0, len(out)))
         used = law.counted > 0
         if used.any():

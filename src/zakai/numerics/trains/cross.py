@@ -113,7 +113,7 @@ class _Cross:
         for k in range(1, grid.n):
             count = min(TIMES * expected[k] + MORE, len(index))
             some = index[np.linspace(0, len(index) - 1, count).astype(int)]
-            parts.append((np.unique(some[:, :k], axis=0), np.unique(some[:, k:], axis=0)))
+            parts.append((distinct(some[:, :k], grid.sizes[:k]), distinct(some[:, k:], grid.sizes[k:])))
         points = []
         for k, (left, right) in enumerate(parts, 1):
             L = grid.centre[:, None] + B[:, :k] @ (grid.low[:k, None] + grid.step[:k, None] * left.T)
@@ -148,6 +148,14 @@ class _Cross:
             self.right[k] = np.concatenate([j[:, None], self.right[k + 1][i]], axis=1)
             cores.append(C.T.reshape(-1, N, b))
         return [self.fibres(0), *cores[::-1]]
+
+
+def distinct(index: Array, sizes: Array) -> Array:
+    """Return the distinct rows of indices (P, k) below sizes (k,), in ascending order."""
+    code = np.zeros(len(index), np.int64)
+    for column, size in zip(index.T, sizes, strict=True):
+        code = code * size + column
+    return np.asarray(index[np.unique(code, return_index=True)[1]])
 
 
 def cross(
@@ -186,6 +194,6 @@ def cross(
         worst = index[np.argsort(-errors, kind="stable")[:WORST]]
         for k in range(1, n):
             if sweep % 2:  # a sweep to the right comes next to the left, and takes the sets of the left
-                work.left[k] = np.unique(np.concatenate([work.left[k], worst[:, :k]]), axis=0)
+                work.left[k] = distinct(np.concatenate([work.left[k], worst[:, :k]]), grid.sizes[:k])
             else:
-                work.right[k] = np.unique(np.concatenate([work.right[k], worst[:, k:]]), axis=0)
+                work.right[k] = distinct(np.concatenate([work.right[k], worst[:, k:]]), grid.sizes[k:])

@@ -52,7 +52,7 @@ class Grid(NamedTuple):
 
     def z_of(self, x: Array) -> Array:
         """Return the coordinates z (n, P) of points x (n, P)."""
-        return np.linalg.solve(self.basis, x - self.centre[:, None])
+        return np.asarray(np.linalg.inv(self.basis) @ (x - self.centre[:, None]))
 
     def x_of(self, z: Array) -> Array:
         """Return the points x (n, P) of coordinates z (n, P)."""

@@ -31,7 +31,7 @@ PATH = types.Tuple((F2, F3))
 TRAIN = types.Tuple((F1, F2, F1, F1, I1, F1, I1, I1, F1, F1, F2, F1))
 # Ranks (n + 1,), sizes (n,), where each core begins (n,), and the cores in the order (N, a, b).
 PACKED = types.Tuple((I1, I1, I1, F1))
-POINTS, TOGETHER = 1024, 64  # of a block, which are sorted, and of one product of matrices
+POINTS, TOGETHER = 2048, 128  # of a block, which are sorted, and of one product of matrices
 LARGEST_LOG = 500.0  # of a factor; the exponential of more is cut
 # Later observations lead into what are tails now, where an error relative to the density becomes one of the mean.  With the power
 # 1/2 of the sums (the scaling of correspondence analysis) the error of a skeleton is relative to the density, as an average over
@@ -86,34 +86,42 @@ def add_train(train: Any, x: Array, moved: bool, scale: Array, out: Array) -> No
     number counts as zero.  Points of a block are sorted by their cell j on each axis: those of a cell are a product of matrices.
     """
     centre, inverse, low, step, sizes, periods, ranks, offsets, flat, mean, whitening, tail = train
-    n, count = low.size, x.shape[1]
+    n, count, tails = low.size, x.shape[1], tail[0] < math.inf
     width, cells = 0, 0
     for k in range(n):
         width, cells = max(width, ranks[k + 1]), max(cells, sizes[k] + 2 * PAD)
-    w, c, y, s = np.empty(6), np.empty(TOGETHER * 6 * width), np.empty(n), np.empty((n, POINTS))
-    v, after, gaussian = np.empty((POINTS, width)), np.empty(TOGETHER * width), np.empty(POINTS)
-    inside, alive, cell = np.empty(POINTS, np.bool_), np.empty(POINTS, np.int64), np.empty(POINTS, np.int64)
+    y, s, square, inside = np.empty((n, POINTS)), np.empty((n, POINTS)), np.empty(POINTS), np.empty(POINTS, np.bool_)
+    w, c, after = np.empty(6), np.empty(TOGETHER * 6 * width), np.empty(TOGETHER * width)
+    v, alive, cell = np.empty((POINTS, width)), np.empty(POINTS, np.int64), np.empty(POINTS, np.int64)
     starts, order = np.empty(cells + 1, np.int64), np.empty(POINTS, np.int64)
     for first in range(0, count, POINTS):
         size, used = min(POINTS, count - first), 0
-        for p in range(size):
+        for d in range(n):
+            for p in range(size):
+                y[d, p] = x[d, first + p] - centre[d]
+            if periods[d] > 0.0:
+                for p in range(size):
+                    y[d, p] -= periods[d] * math.floor(y[d, p] / periods[d] + 0.5)
+        inside[:size], square[:size] = True, 0.0
+        for k in range(n):
+            here, top = s[k], sizes[k] + 1.9
+            here[:size] = -low[k] / step[k]
             for d in range(n):
-                y[d] = x[d, first + p] - centre[d]
-                if periods[d] > 0.0:
-                    y[d] -= periods[d] * math.floor(y[d] / periods[d] + 0.5)
-            within, square = True, 0.0
-            for k in range(n):
-                z, white = 0.0, 0.0
-                for d in range(n):
-                    z += inverse[k, d] * y[d]
-                    white += whitening[k, d] * (y[d] - mean[d])
-                s[k, p] = (z - low[k]) / step[k]
-                within = within and s[k, p] > -2.9 and s[k, p] < sizes[k] + 1.9
-                square += white * white
-            inside[p] = within or square > tail[0]
-            v[p, 0] = 1.0 if within else 0.0
-            gaussian[p] = tail[1] * math.exp(-0.5 * square) if square > tail[0] else -1.0
-            if within:
+                factor, other = inverse[k, d] / step[k], y[d]
+                if factor != 0.0:
+                    for p in range(size):
+                        here[p] += factor * other[p]
+            for p in range(size):
+                inside[p] = inside[p] and here[p] > -2.9 and here[p] < top
+            if tails:
+                for p in range(size):
+                    white = 0.0
+                    for d in range(n):
+                        white += whitening[k, d] * (y[d, p] - mean[d])
+                    square[p] += white * white
+        for p in range(size):
+            v[p, 0] = 1.0 if inside[p] else 0.0
+            if inside[p]:
                 alive[used] = p
                 used += 1
         for k in range(n):
@@ -146,12 +154,13 @@ def add_train(train: Any, x: Array, moved: bool, scale: Array, out: Array) -> No
                         v[order[begin + i], q] = after[i * b + q]
                 begin = end
         for p in range(size):
-            if inside[p]:
+            far = square[p] > tail[0]
+            if inside[p] or far:
                 value = v[p, 0]
-                if gaussian[p] >= 0.0:  # the train from twice the value at the radius, the Gaussian below it, smoothly in between
+                if far:  # the train from twice the value at the radius, the Gaussian below it, smoothly in between
                     share = min(max(value / tail[2] - 1.0, 0.0), 1.0)
                     share *= share * (3.0 - 2.0 * share)
-                    value = share * value + (1.0 - share) * gaussian[p]
+                    value = share * value + (1.0 - share) * tail[1] * math.exp(-0.5 * square[p])
                 value *= scale[0]
                 if moved:
                     value *= math.exp(min(x[n, first + p] - scale[1], LARGEST_LOG))
@@ -317,7 +326,7 @@ def draw(packed: Any, right: Array, share: Array, flat: bool, out: Array) -> Non
 
     Args:
         packed: a train.
-        right: its cores times the sums over all axes to the right (N, a), one after the other.
+        right: its cores times the sums over all axes to the right (a, N), one after the other.
         share: uniform numbers (n, P).
         flat: each conditional law is drawn in proportion to its square root.
         out: receives positions in units of the spacing (n, P), the probability of the cell, and that of having been drawn by the
@@ -335,12 +344,15 @@ def draw(packed: Any, right: Array, share: Array, flat: bool, out: Array) -> Non
         for k in range(n):
             a, b, N = ranks[k], ranks[k + 1], sizes[k]
             total, root_total = 0.0, 0.0
+            w[:N] = 0.0
+            for q in range(a):
+                factor, row = v[q], right[at_right + q * N : at_right + (q + 1) * N]
+                for i in range(N):
+                    w[i] += factor * row[i]
             for i in range(N):
-                t = 0.0
-                for q in range(a):
-                    t += v[q] * right[at_right + i * a + q]
-                w[i] = max(t, 0.0)
+                w[i] = max(w[i], 0.0)
                 root[i] = math.sqrt(w[i])
+            for i in range(N):
                 total += w[i]
                 root_total += root[i]
             at_right += N * a
