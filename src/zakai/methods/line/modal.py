@@ -29,7 +29,7 @@ from zakai.numerics.line.grid_choice import PER, SPACING, WIDENING, coarse_grid
 from zakai.numerics.line.modes import KnownGrids, Start
 from zakai.numerics.line.product import General, weaken
 from zakai.numerics.line.resolution import TRIALS, edge_bound, rounding_bound, spectrum_bound
-from zakai.numerics.line.steps import COLUMNS, STATUSES, Status
+from zakai.numerics.line.steps import FIGURES, STATUSES, Status
 
 ROWS_TOGETHER = 8  # intervals whose likelihoods are computed together
 NEW = 12  # coarse grids and rows that are made for one step
@@ -94,7 +94,7 @@ def advanced(prepared: Prepared, k: int, stop: int, state: State, observed: np.n
     for _ in range(NEW):
         n = window.size if stays else FINE_SIZES[at]
         cosines, sines = waves(n)
-        densities, places, out = np.empty((count, n)), np.empty((count + 1, 4)), np.zeros((count, len(COLUMNS)))
+        densities, places, out = np.empty((count, n)), np.empty((count + 1, 4)), np.zeros((count, FIGURES))
         samples = lm.Samples(k, observed[:count], steps.lengths, steps.precisions[:, 0], steps.constants)
         done, number = lm.advance(
             start, frame, KnownGrids(coarse.numbers, coarse.index), lm.Special(rows, owner, general), placement, samples,

@@ -24,7 +24,7 @@ from zakai.models.prior import GaussianPrior
 from zakai.numerics.arrays import Array
 from zakai.numerics.complex_step import log_determinant
 from zakai.numerics.line import window as lw
-from zakai.numerics.line.averages import GAUSS_NODES, parts_needed, probed
+from zakai.numerics.line.averages import GAUSS_NODES, parts_needed, polynomials_at_nodes, probed
 from zakai.numerics.line.gaussian_kernels import kernel_size, packed
 from zakai.numerics.line.resolution import GROSS
 from zakai.numerics.line.steps import FACTOR, KERNEL, SPLIT, SPLIT_FACTOR, Limits, Mechanisms, Steps
@@ -140,15 +140,18 @@ class Prepared:
         """Return the same for another interval with the same sensors, where only its length and coefficients in time are new."""
         if not self.timed or self.kernels is not None or self.parts is not None or not self.fast[0]:
             return self.over(schedule)
-        lengths = schedule.lengths
-        result = object.__new__(Prepared)
-        vars(result).update(vars(self), schedule=schedule, lengths=lengths)
-        c = coefficients_of(result, self.coefficients)
-        if c.parts[0] != 1:
-            return self.over(schedule)
-        kinds, _, shares, _, _, kernels, *_ = self.steps
-        steps = Steps(kinds, lengths, shares, c.precisions, c.constants, kernels, c.drifts, c.outputs, c.covariances)
-        vars(result).update(coefficients=c, steps=steps)
+        result, system, lengths = object.__new__(Prepared), self.system, schedule.lengths
+        known, before, (kinds, _, shares, _, _, kernels, *_) = vars(result), self.coefficients, self.steps
+        known.update(vars(self), schedule=schedule, lengths=lengths)
+        if system.resolved and system.steady_covariance and system.steady_noise and not system.samples:
+            factors = polynomials_at_nodes(self.polynomials, schedule.starts, schedule.stops, lengths)  # only these are new
+            c = CoefficientsInTime(factors[:, :-1], factors[:, : before.outputs.shape[1]], *before[2:])
+        else:
+            c = coefficients_of(result, before)
+            if c.parts[0] != 1:
+                return self.over(schedule)
+        known["coefficients"] = c
+        known["steps"] = Steps(kinds, lengths, shares, c.precisions, c.constants, kernels, c.drifts, c.outputs, c.covariances)
         return result
 
     @cached_property
@@ -246,6 +249,12 @@ class Prepared:
         return 1e-32 if self.system.samples else lw.DEEP
 
     @cached_property
+    def polynomials(self) -> np.ndarray:
+        """The factors of the terms of f and h where they are polynomials of t (D, R), the highest power first, else nothing."""
+        function = self.system.polynomials
+        return np.zeros((0, 0)) if function is None else function(_X, self.model.start, self.theta)
+
+    @cached_property
     def coefficients(self) -> CoefficientsInTime:
         """The coefficients in time of all intervals."""
         return coefficients_of(self)
@@ -326,17 +335,14 @@ class Prepared:
 
 
 # What of a `Prepared` does not depend on its schedule: what is computed, and with it the fields.
-STEADY = ("divides", "gaussian", "timed", "weak", "mixed", "cut", "limits")
+STEADY = ("divides", "gaussian", "timed", "weak", "mixed", "cut", "limits", "polynomials")
 FIELDS = (*(field.name for field in fields(Prepared)), *STEADY)
 
 
 def coefficients_of(prepared: Prepared, steady: CoefficientsInTime | None = None) -> CoefficientsInTime:
     """Return what the loop needs of the coefficients in time of all intervals; of one, `steady` has those that are constant."""
     schedule, system, theta = prepared.schedule, prepared.system, prepared.theta
-    resolved = system.resolved and not prepared.mixed
-    if steady is not None and resolved and system.steady_covariance and system.steady_noise and not system.samples:
-        return _factors_alone(prepared, steady)
-    count, seen, m = len(schedule), schedule.seen, system.m
+    resolved, count, seen, m = system.resolved, len(schedule), schedule.seen, system.m
     starts, lengths, stops = schedule.starts[:, None], prepared.lengths[:, None], schedule.stops[:, None]
     if prepared.timed:
         t = np.minimum(starts + lengths * GAUSS_NODES, np.nextafter(stops, starts))
@@ -370,7 +376,11 @@ def coefficients_of(prepared: Prepared, steady: CoefficientsInTime | None = None
         factors = np.broadcast_to(np.eye(size + 1), (count, size + 1, size + 1))
     else:
         assert system.separated is not None
-        factors = everywhere(system.separated[0], False)
+        if resolved and prepared.timed:
+            times = np.ascontiguousarray(schedule.starts), np.ascontiguousarray(schedule.stops), prepared.lengths
+            factors = polynomials_at_nodes(prepared.polynomials, *times)[:, : t.shape[1]]
+        else:
+            factors = everywhere(system.separated[0], False)
     if steady is not None and system.steady_covariance:
         covariances = steady.covariances
     else:
@@ -394,16 +404,6 @@ def coefficients_of(prepared: Prepared, steady: CoefficientsInTime | None = None
             parts = np.maximum(parts, parts_needed(precision(noise[:, probes])[0], precisions))
     drifts, outputs = (np.array(factors[:, part], order="C") for part in (own, ends))
     return CoefficientsInTime(drifts, outputs, covariances, precisions, constants, parts)
-
-
-def _factors_alone(prepared: Prepared, steady: CoefficientsInTime) -> CoefficientsInTime:
-    """Return the coefficients of one interval in which only the factors of f and h, which the nodes resolve, vary in time."""
-    assert prepared.system.separated is not None
-    start, stop = prepared.schedule.starts[0], prepared.schedule.stops[0]
-    t = np.minimum(start + prepared.lengths[0] * GAUSS_NODES[None], np.nextafter(stop, start))
-    factors = prepared.system.separated[0](_X, t, prepared.theta)
-    parts = np.array([int(np.isfinite(factors).all())])
-    return steady._replace(drifts=factors, outputs=factors[:, : steady.outputs.shape[1]], parts=parts)
 
 
 def _mixed_terms(prepared: Prepared, t: np.ndarray) -> np.ndarray:

@@ -18,7 +18,7 @@ from zakai.methods._protocol import Infos, Tangents
 from zakai.methods.line import filter as line_filter
 from zakai.methods.line.backward_loop import log_likelihoods
 from zakai.methods.line.coefficients import spectral
-from zakai.methods.line.loop import DIVIDED, START, Piece, grid_of, infos_of
+from zakai.methods.line.loop import Piece, grid_of, infos_of
 from zakai.methods.line.parts import segment_of_parts
 from zakai.methods.line.prepared import Parts, Prepared, State
 from zakai.methods.line.transition import ModalTransition
@@ -27,7 +27,7 @@ from zakai.numerics.arrays import Array
 from zakai.numerics.complex_step import STEP
 from zakai.numerics.line import window as lw
 from zakai.numerics.line.splitting import Interval, TangentCoefficients, through
-from zakai.numerics.line.steps import SPLIT
+from zakai.numerics.line.steps import NEEDED, PAIRS, SPLIT, START, SUBSTEPS
 from zakai.numerics.line.tangents import Varied, extended, resampled_tangents
 
 IN_TIME = "drifts", "outputs", "covariances", "precisions"
@@ -168,7 +168,7 @@ class _Walk:
 
     def _divided(self, prepared: Prepared, piece: Piece, i: int, observed: Array) -> Interval | None:
         """Return what the filter did in a step that was split, None for another one."""
-        k, (pairs, substeps, needed) = piece.first + i, piece.reports[i, DIVIDED]
+        k, (pairs, substeps, needed) = piece.first + i, piece.reports[i, [PAIRS, SUBSTEPS, NEEDED]]
         if substeps == 0.0:
             return None
         length, inside, closed = float(prepared.lengths[k]), bool(prepared.kinds[k] == SPLIT), piece.before.closed

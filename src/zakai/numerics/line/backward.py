@@ -316,8 +316,8 @@ def _split(
     made, constant, magnus = 0.0, 0.0, 0
     if averages.shape[0] > 1:
         both, spreads = np.empty((3, 2, size)), np.empty(3)
-        operators(table, c, averages[0], at, both, spreads)
-        made, pair = averaging(product, both, spreads, spacing, closed)
+        linear = operators(table, c, averages[0], at, both, spreads)
+        made, pair = averaging(product, both, spreads, linear, spacing, closed)
         if not (made <= most):
             magnus = int(min(max(np.ceil(1.1 * (pair / most) ** 0.25), 1.0), 1e6))
             made = pair / float(magnus) ** 4

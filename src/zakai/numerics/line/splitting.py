@@ -86,10 +86,10 @@ def divided(
     begin, phi, drift = density.copy(), np.empty(size), np.empty(size)
     b, first, second = np.empty(size), np.empty(size), np.empty(size)
     magnus, substeps = 0.0, 1.0  # pairs of averages, one after the other, or the mean
-    both, spreads = np.empty((3, 2, size if varying else 1)), np.empty(3)
+    both, spreads, linear = np.empty((3, 2, size if varying else 1)), np.empty(3), False
     if varying:
-        operators(table, c, averages[0], at, both, spreads)
-        mean_error, pair_error = averaging(density, both, spreads, spacing, closed)
+        linear = operators(table, c, averages[0], at, both, spreads)
+        mean_error, pair_error = averaging(density, both, spreads, linear, spacing, closed)
         if mean_error > most:
             magnus = max(np.ceil(1.1 * (pair_error / most) ** 0.25), 1.0)
     for _ in range(8):
@@ -120,8 +120,8 @@ def divided(
             rounding, clipped, spread, constant = rounding + noise, max(clipped, end), spread + own_spread, constant + added
             if varying and (magnus == 0.0 or i % 2 == 1):
                 if parts > 1:
-                    operators(table, c, weights, at, both, spreads)
-                mean_error, pair_error = averaging(density, both, spreads, spacing, closed)
+                    linear = operators(table, c, weights, at, both, spreads)
+                mean_error, pair_error = averaging(density, both, spreads, linear, spacing, closed)
                 time, pairs = time + (pair_error if magnus > 0.0 else mean_error), pairs + pair_error
             total = moments(density)[0]
             if not (1e-200 < total < 1e200):

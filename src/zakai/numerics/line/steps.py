@@ -21,10 +21,11 @@ from zakai.numerics.line.density import spectrum
 from zakai.numerics.line.grid_choice import FAR, log_likelihood
 from zakai.numerics.line.resolution import SPECTRUM_FACTOR
 
-COLUMNS = (
-    "gained", "mean", "variance", "aliasing", "edge", "negative", "time", "depth", "growth", "made", "error", "log_floor",
-    "start", "pairs", "substeps", "needed",
-)  # fmt: skip
+# The figures of a step's report; the last four are those of a splitting, and where its grid begins.
+(
+    GAINED, MEAN, VARIANCE, ALIASING, EDGE, NEGATIVE, TIME, DEPTH, GROWTH, MADE, ERROR, LOG_FLOOR, START, PAIRS, SUBSTEPS, NEEDED
+) = range(16)  # fmt: skip
+FIGURES = NEEDED + 1
 # The transition: whole with a sample after it, split with increments inside, whole with increments inside, split with a sample.
 FACTOR, SPLIT, KERNEL, SPLIT_FACTOR = 0, 1, 2, 3
 TABLE_MARGIN = 96  # points of a table of coefficients in time beyond the grid; a third may be used before it is made again
@@ -190,7 +191,7 @@ class Resolution(NamedTuple):
 
 
 class Segment(NamedTuple):
-    """The densities (K, N) after the first steps and their reports (K, len(COLUMNS)).
+    """The densities (K, N) after the first steps and their reports (K, FIGURES).
 
     The column `start` of a report is the first point of the grid in the table.  `status` is why the loop ended, and `answer` the
     range of the grid that it needs, relative to the centre of the present one, and its spacing.
