@@ -377,7 +377,7 @@ def coefficients_of(prepared: Prepared, steady: CoefficientsInTime | None = None
     else:
         assert system.separated is not None
         if resolved and prepared.timed:
-            times = np.ascontiguousarray(schedule.starts), np.ascontiguousarray(schedule.stops), prepared.lengths
+            times = np.array(schedule.starts), np.array(schedule.stops), prepared.lengths
             factors = polynomials_at_nodes(prepared.polynomials, *times)[:, : t.shape[1]]
         else:
             factors = everywhere(system.separated[0], False)

@@ -237,18 +237,14 @@ def split(
                 return np.inf, 1.0
             clipped = max(clipped, density[j])
             density[j], outer, gauge = 0.0, -OVERFLOW, 0.0
-        early[j], late[j], joint[j], work[j] = outer - gauge, outer + gauge, 2.0 * outer, gauge
-        middle[j] = 4.0 * outer - correction * first[j] * first[j]
-    for exponents in (early, middle, late):
+        early[j], work[j], middle[j] = outer, gauge, 4.0 * outer - correction * first[j] * first[j]
+    for exponents in (early, work, middle):
         exponentiate(exponents)
-    if narrow:
-        exponentiate(work)
-    else:
-        work[:] = 1.0
-    if substeps > 1.0:
-        exponentiate(joint)
     for j in range(size):
-        density[j] *= early[j]
+        late[j], joint[j] = early[j] * work[j], early[j] * early[j]
+        density[j] *= early[j] / work[j]
+    if not narrow:
+        work[:] = 1.0
     variance = part / (spacing * spacing)
     # Between exponentials of such a slope the kernel is as wide, about a mean that the slope displaces.
     taps = taps_of(variance, 0.5 * (np.sqrt(2.0 * depth) + steepest * np.sqrt(variance)) ** 2, size, narrow)

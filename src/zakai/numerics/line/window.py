@@ -56,7 +56,7 @@ def _nearest(values: Array, window: Window, at: Array) -> tuple[Array, Array]:
 
 Operator = Array | FourierOperator
 
-SIZES = (32, 48, 64, 80, 96, 112, 128, 160, 192, 256, 384, 512, 768, 1024, 1536, 2048, 3072, 4096)
+SIZES = (32, 48, 64, 80, 96, 112, 128, 160, 192, 256, 320, 384, 512, 768, 1024, 1536, 2048, 3072, 4096)
 LARGEST = 384  # points of a grid on which matrices propagate densities
 LARGE = 1024  # points of a grid on which matrices propagate messages, and kernels and splitting densities
 CUT = 1e-13  # density relative to its maximum that a new grid must hold
