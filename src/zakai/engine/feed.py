@@ -153,7 +153,7 @@ class Feed:
 @lru_cache(KEPT)
 def _row(values: tuple[float, ...], kind: type) -> np.ndarray:
     """Return the array (1, m) of the only row of a schedule, which is often the same."""
-    result = np.array([values], kind)
+    result: np.ndarray = np.array([values], kind)
     result.setflags(write=False)
     return result
 

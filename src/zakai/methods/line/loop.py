@@ -16,6 +16,7 @@ from zakai.methods._states import Joined, StackedStates
 from zakai.methods.line import modal
 from zakai.methods.line.cache import Derived
 from zakai.methods.line.coefficients import misses_drift, on_grid_for_drift, sensor_at_nodes
+from zakai.methods.line.prepared import INTERVALS_TOGETHER as INTERVALS_TOGETHER
 from zakai.methods.line.prepared import Prepared, State
 from zakai.methods.line.update import edge_of_moments, grid_check, on_fitting_grid, outside_tables, resampled, state_moments
 from zakai.numerics.arrays import Array
@@ -118,7 +119,6 @@ def _mixed(prepared: Prepared, window: lw.Window, x: np.ndarray, rows: slice) ->
 
 
 LARGER = 0.2  # margin of a new grid, relative to the range of the density
-INTERVALS_TOGETHER = 32  # intervals whose tables of coefficients in time are computed together
 HEALTH = {
     "edge_mass": ls.EDGE, "negative_mass": ls.NEGATIVE, "aliasing": ls.ALIASING, "time_error": ls.TIME, "tail_depth": ls.DEPTH,
     "error_estimate": ls.ERROR,
@@ -180,7 +180,7 @@ def one(prepared: Prepared, k: int, state: State, observed: np.ndarray) -> tuple
         return None
     first = pieces[0]
     place = first.before.origin, float(first.centres[0]), float(first.spacings[0])
-    return first.last, _info(prepared, k, first.last, place, first.reports[0])
+    return first.last, _info(prepared, k, first.last, place, first.reports[0].tolist())
 
 
 def _single(prepared: Prepared, k: int, state: State, observed: np.ndarray) -> tuple[State, Info] | None:
@@ -196,13 +196,13 @@ def _single(prepared: Prepared, k: int, state: State, observed: np.ndarray) -> t
     segment = advance(prepared.mechanisms, start, grid, prepared.steps, k, observed, prepared.limits)
     if not len(segment.reports):
         return None
-    report, origin, spacing = segment.reports[0], state.origin, float(state.spacing)
-    centre = spacing * (round(state.centre / spacing) + (float(report[ls.START]) - grid.start))
-    error, log_floor = float(report[ls.ERROR]), float(report[ls.LOG_FLOOR])
+    figures, origin, spacing = segment.reports[0].tolist(), state.origin, float(state.spacing)
+    centre = spacing * (round(state.centre / spacing) + (figures[ls.START] - grid.start))
+    error, log_floor = figures[ls.ERROR], figures[ls.LOG_FLOOR]
     state = State(segment.densities[0], origin, centre, spacing, state.unit, state.closed, error, log_floor)
     if segment.status == ls.Status.AFTER:
         state = regridded(prepared, state)
-    return state, _info(prepared, k, state, (origin, centre, spacing), report)
+    return state, _info(prepared, k, state, (origin, centre, spacing), figures)
 
 
 def compiled_steps(prepared: Prepared, rows: slice, state: State, observed: np.ndarray) -> list[Piece]:
@@ -306,13 +306,12 @@ def _infos(prepared: Prepared, piece: Piece) -> Infos:
     return Infos(piece.reports[:, ls.GAINED], mean[:, None], variance[:, None, None], health)
 
 
-def _info(prepared: Prepared, k: int, state: State, place: Place, report: Array) -> Info:
+def _info(prepared: Prepared, k: int, state: State, place: Place, figures: list[float]) -> Info:
     """Return the report of interval k, after which the state is this one."""
 
     def each(function: Callable[[State, float], Any]) -> np.ndarray:
         return np.asarray(function(state, float(prepared.schedule.stops[k])))
 
-    figures = report.tolist()
     mean, variance, health = _report(prepared, place, figures, each)
     return Info(figures[ls.GAINED], np.array([mean]), np.array([[variance]]), health)
 

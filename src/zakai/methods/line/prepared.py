@@ -26,13 +26,13 @@ from zakai.numerics.complex_step import log_determinant
 from zakai.numerics.line import window as lw
 from zakai.numerics.line.averages import GAUSS_NODES, parts_needed, polynomials_at_nodes, probed
 from zakai.numerics.line.gaussian_kernels import kernel_size, packed
-from zakai.numerics.line.resolution import GROSS
+from zakai.numerics.line.resolution import GROSS, MAGNUS
 from zakai.numerics.line.steps import FACTOR, KERNEL, SPLIT, SPLIT_FACTOR, Limits, Mechanisms, Steps
 from zakai.records.schedule import Schedule, lengths_of
 
 T = TypeVar("T")
-KERNEL_SHARE = 2e-2  # of the promised error that the splitting of one interval may leave in `limited-direct`
 SHARE = 5e-3  # of the tolerance that the splitting of one interval may leave
+INTERVALS_TOGETHER = 32  # intervals whose tables of coefficients in time, or likelihoods, are computed together
 SHARED = 128  # points of the largest grid on which many steps share a decomposition
 ROUNDS = 2  # of cutting, after which what is not resolved is left to adaptive substeps
 _X = np.zeros(1)
@@ -106,9 +106,9 @@ class Prepared:
     """What is known without data.
 
     `tolerance` is what substeps are chosen for, `promised` the error of a step above which a result warns; `negligible` the
-    spectrum that need not be resolved; `generous` the size of a grid that is retained though fewer points would do; `pieces`
-    whether densities are polynomials between ends and kinks; `grid_cache` holds what was computed for single grids; `shares` (K,)
-    are those of parts in the time of their intervals, and `cut_up` whether these are parts of one interval.
+    spectrum that need not be resolved; `pieces` whether densities are polynomials between ends and kinks; `grid_cache` holds what
+    was computed for single grids; `shares` (K,) are those of parts in the time of their intervals, and `cut_up` whether these are
+    parts of one interval.
     """
 
     model: Model
@@ -117,7 +117,6 @@ class Prepared:
     system: System
     tolerance: float
     negligible: float
-    generous: int
     promised: float
     yau: YauLine | None = None
     lie: bool = False
@@ -150,8 +149,7 @@ class Prepared:
             c = coefficients_of(result, before)
             if c.parts[0] != 1:
                 return self.over(schedule)
-        known["coefficients"] = c
-        known["steps"] = Steps(kinds, lengths, shares, c.precisions, c.constants, kernels, c.drifts, c.outputs, c.covariances)
+        known.update(coefficients=c, steps=Steps(kinds, lengths, shares, *c[3:5], kernels, *c[:3]))
         return result
 
     @cached_property
@@ -269,6 +267,11 @@ class Prepared:
         """The points of the largest grid of the compiled loop, and of any grid where a larger one does not help."""
         return lw.LARGE if self.gaussian else lw.LARGEST
 
+    @property
+    def generous(self) -> int:
+        """The size of a grid that is retained though fewer points would do."""
+        return lw.LARGE if self.timed and self.model.periodic else SHARED
+
     def largest_for(self, check: lw.GridCheck | None = None, size: int = 0) -> int:
         """Return the points of the largest grid for a density with some figures on a grid of some size.
 
@@ -294,10 +297,9 @@ class Prepared:
     @cached_property
     def limits(self) -> Array:
         """What a step of the compiled loop must keep, as the fields of `steps.Limits`."""
-        splitting = SHARE * self.tolerance if self.yau is None else KERNEL_SHARE * self.promised
-        generous = lw.LARGE if self.timed and self.model.periodic else self.generous
+        splitting = SHARE * self.tolerance if self.yau is None else MAGNUS * self.promised
         finest = 512.0 if self.system.samples else 256.0
-        return np.array(Limits(self.negligible, self.promised, splitting, self.cut, generous, finest), float)
+        return np.array(Limits(self.negligible, self.promised, splitting, self.cut, self.generous, finest), float)
 
     @cached_property
     def mechanisms(self) -> Mechanisms:
@@ -311,8 +313,7 @@ class Prepared:
     @cached_property
     def fast(self) -> list[bool]:
         """Which intervals (K,) the compiled loop may take."""
-        result: list[bool] = (self.kinds >= 0).tolist()
-        return result
+        return list((self.kinds >= 0).tolist())
 
     def deepest(self, floor: float) -> float:
         """Return the depth of the tails, as a logarithm below the maximum, to which a density with this floor is accurate."""
@@ -455,9 +456,8 @@ def steps_of(prepared: Prepared) -> Steps:
         if len(here):
             parameters[here] = packed(kernels.transitions, kernels.place[here])
         precisions = np.where((kinds == KERNEL)[:, None, None, None], 0.0, precisions)
-    lengths = np.ascontiguousarray(prepared.lengths)
     shares = np.ones(len(kinds)) if prepared.shares is None else prepared.shares
-    return Steps(kinds, lengths, shares, precisions, c.constants, parameters, c.drifts, c.outputs, c.covariances)
+    return Steps(kinds, np.ascontiguousarray(prepared.lengths), shares, precisions, c.constants, parameters, *c[:3])
 
 
 def parts_of(prepared: Prepared) -> Parts | None:

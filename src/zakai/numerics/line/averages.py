@@ -28,7 +28,7 @@ _V, _M = float64[::1], float64[:, ::1]
 
 @kernel(float64[:, :, ::1](_M, _V, _V, _V), complex128[:, :, ::1](complex128[:, ::1], _V, _V, _V))
 def polynomials_at_nodes(coefficients: Array, starts: Array, stops: Array, lengths: Array) -> Array:
-    """Return polynomials of time (D, R), the highest power first, at the Gauss nodes of intervals and at their ends (K, Q + 1, R)."""
+    """Return polynomials of time (D, R), the highest power first, at the nodes of intervals and at their ends (K, Q + 1, R)."""
     result = np.empty((starts.size, NODES + 1, coefficients.shape[1]), coefficients.dtype)
     for k in range(starts.size):
         for q in range(NODES + 1):
@@ -91,7 +91,7 @@ class Panels(NamedTuple):
     error: float
 
 
-def panels(coefficients: Callable[[Array], Array], start: float, stop: float, tolerance: float = 1e-8) -> Panels:
+def panels(coefficients: Callable[[Array], Array], start: float, stop: float, tolerance: float = RESOLVED_IN_TIME) -> Panels:
     """Return parts of [start, stop] in each of which the polynomial through six Gauss nodes agrees with the coefficients.
 
     Args:
@@ -123,7 +123,7 @@ def panels(coefficients: Callable[[Array], Array], start: float, stop: float, to
 
 _EXACT = 1e-14  # second Legendre coefficient in time, relative to the mean, that is rounding
 MOST_MAGNUS = 32  # equal parts of an interval with two averages each
-MEAN, EARLY, LATE, DIFFERENCE, SECOND = 0, 1, 2, 3, 4  # weights of a part
+MEAN, EARLY, LATE, DIFFERENCE, SECOND = range(5)  # weights of a part
 
 
 def _averages() -> Array:

@@ -24,11 +24,10 @@ from zakai.numerics.line.averages import AVERAGES, WHOLE
 from zakai.numerics.line.density import circular_rows, highest_of, moments, separated, shifted, spectrum, support, waves
 from zakai.numerics.line.gaussian_kernels import BAND, convolved, kernel_of
 from zakai.numerics.line.product import WEAK_SHARE, weak_error, weaken
-from zakai.numerics.line.resolution import RELIABLE, RESOLVED, SPECTRUM_FACTOR, step_error
+from zakai.numerics.line.resolution import GROSS, RELIABLE, RESOLVED, SPECTRUM_FACTOR, step_error
 from zakai.numerics.line.splitting import Accuracy, divided
 from zakai.numerics.line.window import ALIGNMENT, CUT
 
-COARSE = 1e-5  # spectrum of a product at the highest frequencies from which a somewhat finer grid does not serve
 _V, _M = float64[::1], float64[:, ::1]
 
 
@@ -114,7 +113,8 @@ def _loop(kernels: bool, splits: bool, varying: bool, samples: bool, weak: bool,
             )
             if status != ls.OK:
                 break
-            predicted, gained = moments(density)[2], np.log(mass) + constants[k] + move.log_factor
+            (_, mean, variance), gained = moments(density), np.log(mass) + constants[k] + move.log_factor
+            predicted = variance
             log_floor *= min(max(predicted / max(move.contraction**2 * before, 1e-300), 1.0), 20.0)
             log_floor = max(log_floor, np.log(max(cut, move.clipped)))
             floor = np.exp(log_floor) + edge + (0.0 if positive else aliasing)
@@ -137,7 +137,7 @@ def _loop(kernels: bool, splits: bool, varying: bool, samples: bool, weak: bool,
                 if not (aliasing <= limit):
                     answer[0], answer[1], answer[2] = float(low), float(high), 0.6 * spacing
                     status = ls.FAILED if weak or not positive or not (aliasing < np.inf) else ls.RANGE
-                    if not closed and status == ls.RANGE and aliasing > COARSE:
+                    if not closed and status == ls.RANGE and aliasing > GROSS:
                         status = ls.UNRESOLVED
                     break
                 if np.isnan(added) or not (closed or max(left, right) < 1e-10):
@@ -145,14 +145,14 @@ def _loop(kernels: bool, splits: bool, varying: bool, samples: bool, weak: bool,
                     break
                 if not closed:
                     edge = max(edge, min(left, right) if positive else max(left, right))
-                worst, gained = max(worst, aliasing), gained + added
+                worst, gained, (_, mean, variance) = max(worst, aliasing), gained + added, moments(density)
             # The report.
-            row[ls.MEAN], row[ls.VARIANCE] = moments(density)[1:]
+            row[ls.MEAN], row[ls.VARIANCE] = mean, variance
             made = step_error(worst, edge, negative, move.rounding + move.error, floor * growth)
             if not (made <= most):
                 status = ls.FAILED
                 break
-            ratio = np.sqrt(max(before * row[ls.VARIANCE], 0.0)) / max(predicted, 1e-300)
+            ratio = np.sqrt(max(before * variance, 0.0)) / max(predicted, 1e-300)
             if inside:
                 ratio *= np.exp(-min(0.5 * move.spread / max(before * spacing * spacing, 1e-300), 5.0))
             ratio = 1.0 if separated(density) else min(max(ratio, 0.3), 1.0)

@@ -25,7 +25,7 @@ from zakai.numerics.arrays import Array
 from zakai.numerics.compiled import helper, kernel
 from zakai.numerics.exponentials import exponentiate
 from zakai.numerics.line.density import highest_of
-from zakai.numerics.line.grid_choice import PER, Outlook, place_of, wanted, weigh, weighed
+from zakai.numerics.line.grid_choice import DECAYED, PER, Outlook, place_of, wanted, weigh, weighed
 from zakai.numerics.line.resolution import (
     EDGE_OF_ALIASING,
     LOST_MASS,
@@ -40,7 +40,6 @@ from zakai.numerics.line.window import CUT, LARGEST
 
 _V = float64[::1]
 
-_NEGLIGIBLE = 42.0  # -log of the factor of a mode that is negligible
 _SPREAD = 0.01  # of the value at an abrupt end that the interpolant spreads to the middle of the grid
 FALL = 4.2  # half of the range of erfc(y) / 2 from one to zero
 
@@ -49,7 +48,7 @@ FALL = 4.2  # half of the range of erfc(y) / 2 from one to zero
 def decayed(rates: Array, time: float) -> Array:
     """Return exp(-time rates) of the modes that are not negligible; the rates increase."""
     count = 1
-    while count < rates.size and time * (rates[count] - rates[0]) < _NEGLIGIBLE:
+    while count < rates.size and time * (rates[count] - rates[0]) < DECAYED:
         count += 1
     decay = np.empty(count)
     for n in range(count):

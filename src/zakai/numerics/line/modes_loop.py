@@ -172,7 +172,7 @@ def advance(
             if weak or not (unsampled < np.inf):
                 return i, ls.FAILED
             return i, ls.SIZE if not stays else (ls.RANGE if closed else ls.UNRESOLVED)
-        growth, below = min(growth * np.exp(min(deeper, 300.0)), 1e80), below + deeper
+        growth, below = growth * np.exp(min(deeper, 300.0)), below + deeper
         aliasing, rounding = max(move.aliasing, unsampled), move.rounding + (move.unsure + more)
         edge = move.edge if closed else max(move.edge, on_left, on_right)
         row[ls.MEAN], row[ls.VARIANCE] = moments(density)[1:]

@@ -265,14 +265,13 @@ def split(
 
 
 _V, _M, _T = float64[::1], float64[:, ::1], float64[:, :, ::1]
-_DEPTH = 80.0  # logarithm below the maximum at which the samples of a kernel end
 
 
 class Interval(NamedTuple):
     """What the filter did in an interval on a grid.
 
     `observed` (m,) acts `inside` the interval or not at all; `pairs` of averages of the coefficients, zero for the mean, were
-    used in `substeps`, with a kernel that is `narrow` in spacings or not.
+    used in `substeps`, with a kernel that is `narrow` in spacings or not; `depth` as in `Accuracy`.
     """
 
     length: float
@@ -283,6 +282,7 @@ class Interval(NamedTuple):
     pairs: int
     substeps: int
     narrow: bool
+    depth: float
 
 
 class TangentCoefficients(NamedTuple):
@@ -372,7 +372,7 @@ def _split(interval: Interval, average: _Average, v: Array, dv: Array) -> tuple[
     variance, turned = float(variances[0].real), np.ascontiguousarray(variances.imag) / STEP
     change = np.abs(np.diff(phi[0].real)) + 5.0 * np.abs(np.diff(outer[0].real))
     steepest = float(np.max(change[v[1:] > 1e-13 * np.max(v)], initial=0.0))
-    taps = narrow_taps(variance) if interval.narrow else _samples(variance, steepest, len(v))
+    taps = narrow_taps(variance) if interval.narrow else _samples(variance, interval.depth, steepest, len(v))
     _along(v, dv, factors, slopes, *(np.ascontiguousarray(one[: len(v)]) for one in taps), turned, order)
     return v, dv
 
@@ -453,8 +453,8 @@ def _along(v: Array, dv: Array, factors: Array, slopes: Array, taps: Array, chan
             v[j] *= factors[which, j]
 
 
-def _samples(variance: float, steepest: float, most: int) -> tuple[Array, Array]:
+def _samples(variance: float, depth: float, steepest: float, most: int) -> tuple[Array, Array]:
     """Return up to `most` samples of a Gaussian between exponentials of a slope, and their derivatives in the variance."""
-    squares = np.arange(min(np.ceil(np.sqrt(2.0 * _DEPTH * variance) + steepest * variance) + 1.0, most)) ** 2
+    squares = np.arange(min(np.ceil(np.sqrt(2.0 * depth * variance) + steepest * variance) + 1.0, most)) ** 2
     taps = np.exp(-0.5 * squares / variance) / np.sqrt(2.0 * np.pi * variance)
     return taps, taps * 0.5 * (squares / variance - 1.0) / variance

@@ -62,7 +62,6 @@ LARGE = 1024  # points of a grid on which matrices propagate messages, and kerne
 CUT = 1e-13  # density relative to its maximum that a new grid must hold
 DEEP = 1e-20  # the same of densities whose small values are accurate
 SMALL = 1e-8  # density relative to its maximum below which its logarithm is interpolated
-POINTS_TOGETHER = 256  # points at which values of a large grid are interpolated together
 ALIGNMENT = 8  # centres are at multiples of so many spacings
 
 
@@ -251,8 +250,8 @@ def refined(window: Window, factor: float = 2**0.5) -> Window:
 
 def interpolated(values: Array, window: Window, offsets: Array) -> Array:
     """Return the interpolants of values (..., N) at offsets (J,) from the origin."""
-    if len(offsets) > POINTS_TOGETHER and window.size > LARGE:
-        parts = np.array_split(offsets, -(-len(offsets) // POINTS_TOGETHER))
+    if len(offsets) > LARGEST and window.size > LARGE:
+        parts = np.array_split(offsets, -(-len(offsets) // LARGEST))
         return np.concatenate([interpolated(values, window, part) for part in parts], axis=-1)
     at = (offsets - window.centre) / window.spacing + window.size // 2
     nearest = np.round(at)
