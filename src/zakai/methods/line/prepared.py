@@ -270,7 +270,8 @@ class Prepared:
     @property
     def generous(self) -> int:
         """The size of a grid that is retained though fewer points would do."""
-        return lw.LARGE if self.timed and self.model.periodic else SHARED
+        size = 2 * SHARED if self.kinked else SHARED  # with kinks a grid is finer, and another one takes long to prepare
+        return lw.LARGE if self.timed and self.model.periodic else size
 
     def largest_for(self, check: lw.GridCheck | None = None, size: int = 0) -> int:
         """Return the points of the largest grid for a density with some figures on a grid of some size.
