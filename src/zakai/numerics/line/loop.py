@@ -10,7 +10,7 @@ first step that is not accurate enough, or needs another grid or table, and retu
 
 from __future__ import annotations
 
-from functools import cache
+from functools import cache, lru_cache
 from itertools import product as product_of
 from typing import Any
 
@@ -206,9 +206,17 @@ def advance(
     """
     count, size = len(observed), len(state.values)
     results = ls.Results(np.empty((count, size)), np.empty((count + 1, ls.FIGURES)))
-    known = ls.Constants(AVERAGES if mechanisms.varying else WHOLE, *waves(size))
+    known = _constants(size, mechanisms.varying)
     done, number = _loop(*mechanisms)(state, grid, steps, first, observed, limits, known, results)
     densities, out = results
+    if done < count:
+        densities = densities[:done]
     if mechanisms.closed:
-        circular_rows(densities[:done], known.cosines, known.sines, out)
-    return ls.Segment(densities[:done], out[:done], ls.STATUSES[number], out[-1, :3])
+        circular_rows(densities, known.cosines, known.sines, out)
+    return ls.Segment(densities, out[:done], ls.STATUSES[number], out[-1, :3])
+
+
+@lru_cache(maxsize=32)
+def _constants(size: int, varying: bool) -> ls.Constants:
+    """Return what the loop reads of all grids of a size."""
+    return ls.Constants(AVERAGES if varying else WHOLE, *waves(size))
