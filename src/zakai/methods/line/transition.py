@@ -34,6 +34,7 @@ from zakai.methods.line.update import refitted
 from zakai.numerics.arrays import Array, Number
 from zakai.numerics.line import window as lw
 from zakai.numerics.line.averages import GAUSS_NODES, GAUSS_WEIGHTS
+from zakai.numerics.line.grid_choice import DECAYED
 from zakai.numerics.line.operator import FourierOperator, Generator, exponential_of
 from zakai.numerics.line.product import finer
 from zakai.numerics.line.resolution import (
@@ -51,7 +52,6 @@ from zakai.numerics.line.resolution import (
 )
 
 PARTS_OF_SUBSTEP = (1, 4, 16)  # of a substep with six nodes each, where the grid moves
-SMOOTHED = 100.0  # decay of the shortest wave of a large grid, as a logarithm, after which a coarser grid serves
 
 
 class Substep(NamedTuple):
@@ -116,7 +116,8 @@ def _acted(
     if exponents.lift > GROWTH:
         return Trial(values, 0.0, 0.0, True)
     matrices, result, error = [window.generator(*one) for one in exponents.generators], values, 0.0
-    if any(isinstance(one, FourierOperator) and one.decay > SMOOTHED for one in matrices):
+    # A coarser grid serves where no short wave is left of a large one.
+    if any(isinstance(one, FourierOperator) and one.decay > DECAYED for one in matrices):
         return Trial(values, 0.0, 0.0, True)
     if adjoint:
         matrices = [one.T for one in matrices[::-1]]

@@ -25,9 +25,7 @@ from zakai.numerics.line import window as lw
 from zakai.numerics.line.density import moments, support
 from zakai.numerics.line.grid_choice import DEPTH, MOST_CELLS
 from zakai.numerics.line.resolution import GROSS, RESOLVED
-from zakai.numerics.line.steps import exponent_added
-
-_NOTHING = 1e-290
+from zakai.numerics.line.steps import LEAST, exponent_added
 
 
 @dataclass(frozen=True)
@@ -104,7 +102,7 @@ def multiplied(values: Array, window: lw.Window, likelihood: Likelihood, rough: 
     for _ in range(12):
         new_values = lw.resampled(values, window, new)
         if not new_values.any():  # the observation contradicts all that is known, which the depth reports
-            new_values = np.full_like(new_values, _NOTHING)
+            new_values = np.full_like(new_values, LEAST)
         product = _product(values, window, new_values, new, likelihood)
         if not np.isfinite(product.log_mass.real):
             return product
