@@ -26,7 +26,7 @@ from zakai.numerics.line import modes_loop as lm
 from zakai.numerics.line import window as lw
 from zakai.numerics.line.density import circular_rows, waves
 from zakai.numerics.line.grid_choice import PER, REACH, SPACING, coarse_grid
-from zakai.numerics.line.modes import KnownGrids, Start
+from zakai.numerics.line.modes import KnownGrids, Start, gathered
 from zakai.numerics.line.product import General, weaken
 from zakai.numerics.line.resolution import TRIALS, edge_bound, rounding_bound, spectrum_bound
 from zakai.numerics.line.steps import FIGURES, STATUSES, Status
@@ -219,7 +219,7 @@ def coarsened(prepared: Prepared, values: Array, window: lw.Window, length: floa
             scale = np.exp(_gauge(prepared, coarse, points) - decomposed.top)
             if np.ndim(covariance):
                 scale = scale / np.sqrt(covariance)
-            result, error = decomposed.carried(lw.gathered(retained / scale, window.offsets[inner], coarse), length)
+            result, error = decomposed.carried(gathered(retained / scale, window.offsets[inner], coarse), length)
         trusted = (coarse.offsets >= low) & (coarse.offsets <= high)
         ends = np.flatnonzero(trusted)[[0, 1, -2, -1]]
         result = np.where(trusted, result, 0.0)

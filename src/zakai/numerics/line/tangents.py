@@ -17,10 +17,10 @@ from scipy.special import erfc
 
 from zakai.numerics.arrays import Array
 from zakai.numerics.complex_step import STEP
-from zakai.numerics.line.modes import FALL
+from zakai.numerics.line.modes import FALL, gathered
 from zakai.numerics.line.operator import Spectral, quotients
 from zakai.numerics.line.resolution import ROUNDING
-from zakai.numerics.line.window import CUT, SMALL, Window, density_at, gathered, interpolated, local_polynomial
+from zakai.numerics.line.window import CUT, SMALL, Window, density_at, interpolated, local_polynomial
 
 
 class Varied(NamedTuple):

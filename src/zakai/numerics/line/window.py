@@ -272,21 +272,6 @@ def interpolated(values: Array, window: Window, offsets: Array) -> Array:
     return np.asarray(np.where(inside, np.where(exact, own, result), 0.0))
 
 
-def gathered(values: Array, offsets: Array, window: Window) -> Array:
-    """Return the values (J,) at offsets, times the matrix of interpolation from a grid on the line to them: (N,)."""
-    at = (offsets - window.centre) / window.spacing + window.size // 2
-    nearest = np.round(at)
-    distance = at[:, None] - np.arange(window.size)
-    exact = np.abs(at - nearest) < 1e-12
-    sine = np.where(exact, 0.0, np.sin(np.pi * (at - nearest)) * np.where(nearest % 2 == 0, 1.0, -1.0))
-    signs = np.where(np.arange(window.size) % 2 == 0, 1.0, -1.0)
-    with np.errstate(divide="ignore"):
-        inverse = np.where(exact[:, None], 0.0, 1.0 / distance)
-    result = (values * sine / np.pi) @ inverse * signs
-    np.add.at(result, nearest[exact].astype(int), values[exact])
-    return np.asarray(result)
-
-
 def resampled(values: Array, window: Window, new: Window) -> Array:
     """Return the probabilities of the points of another grid."""
     if new == window:
