@@ -254,7 +254,7 @@ class FourierExponential:
             for k in count(1):
                 term = self.operator @ term / (parts * k)
                 vector = vector + term
-                if not np.max(np.abs(term.real)) >= negligible:
+                if not np.max(np.abs(term.real)) > negligible:
                     break
             vector = vector * np.exp(self.shift / parts)
         return vector, 1e-15 * (1.0 + self.norm)
