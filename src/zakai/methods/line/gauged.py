@@ -27,6 +27,7 @@ from zakai.numerics.line.backward import FEWEST, SMALLEST
 from zakai.numerics.line.density import support
 from zakai.numerics.line.resolution import SUPPORT, TRIALS, noise_bound
 
+BULK = 1e-7  # of the maximum: there smaller values may be tails
 POINTS_OF_CURVATURE = 5  # points of a message that tell the curvature of its logarithm beyond an end
 STEEP = 3.0  # least fall beyond the ends of a message, in deviations
 RELAXED = 4.0  # spacings that a message may need: its product with the density shows whether it does
@@ -54,7 +55,7 @@ class Psi(NamedTuple):
     def reliable(self, weights: Array | float = 1.0) -> tuple[int, int]:
         """Return the first and the last point of psi times weights that are no noise, as far outward as this falls."""
         product = np.where(self.values.real > SURE_OF_DENSITY * np.abs(self.values.imag), self.values.real, 0.0) * weights
-        first, last = support(product, lw.SMALL)
+        first, last = support(product, BULK)
         while first > 0 and 0.0 < product[first - 1] < product[first]:
             first -= 1
         while last < len(product) - 1 and 0.0 < product[last + 1] < product[last]:

@@ -118,7 +118,6 @@ def _mixed(prepared: Prepared, window: lw.Window, x: np.ndarray, rows: slice) ->
     return table
 
 
-LARGER = 0.2  # margin of a new grid, relative to the range of the density
 HEALTH = {
     "edge_mass": ls.EDGE, "negative_mass": ls.NEGATIVE, "aliasing": ls.ALIASING, "time_error": ls.TIME, "tail_depth": ls.DEPTH,
     "error_estimate": ls.ERROR,
@@ -275,7 +274,7 @@ def _covering(prepared: Prepared, state: State, low: float, high: float, spacing
         size = lw.size_for(2 * np.pi / spacing)
         new = window._replace(size=size, spacing=2 * np.pi / size)
     else:
-        new = lw.quantized(window, low + window.centre, high + window.centre, spacing, LARGER, prepared.largest_for())
+        new = lw.quantized(window, low + window.centre, high + window.centre, spacing, most=prepared.largest_for())
         if new.spacing * new.size < high - low:
             return None
     if new == window:
@@ -290,7 +289,7 @@ def regridded(prepared: Prepared, state: State) -> State:
     check = grid_check(prepared, values, window)
     if prepared.gaussian:
         check = check._replace(resolving=check.resolving * BAND / 0.92)
-    new_values, new, _ = on_fitting_grid(prepared, np.asarray(values), window, check, prepared.generous, LARGER)
+    new_values, new, _ = on_fitting_grid(prepared, np.asarray(values), window, check, prepared.generous)
     return state if new == window else state._replace(values=new_values, centre=new.centre, spacing=new.spacing)
 
 

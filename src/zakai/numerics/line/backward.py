@@ -277,7 +277,7 @@ def by_modes(
     return BackwardSteps(result, completed, products[count - completed :], out[count - completed :])
 
 
-EXCURSION = float(np.sqrt(-0.5 * np.log(CUT)))  # standard deviations of the noise that a path between two points goes beyond them
+EXCURSION = 3.9  # standard deviations of the noise that a path between two points goes beyond them, but for exp(-30)
 
 
 @helper

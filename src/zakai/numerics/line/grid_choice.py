@@ -14,12 +14,11 @@ import numpy as np
 from zakai.numerics.arrays import Array
 from zakai.numerics.compiled import helper
 from zakai.numerics.line.density import highest_of
-from zakai.numerics.line.resolution import NOISE
-from zakai.numerics.line.window import ALIGNMENT, CUT, SIZES, SMALL, STENCIL_WEIGHTS
+from zakai.numerics.line.window import ALIGNMENT, SIZES, SMALL, STENCIL_WEIGHTS
 
 PER = 8  # points of rows in a spacing of the grid
 _STENCIL = len(STENCIL_WEIGHTS)
-DEPTH = float(-np.log(NOISE))  # logarithm below the largest value from which cells are left out
+DEPTH = 34.0  # logarithm below the largest value from which cells are left out
 MOST_CELLS = 4096
 
 
@@ -238,8 +237,7 @@ def sampled(
 
 
 PROFILE = 4096  # offsets at which f and G are known without a grid
-# Standard deviations of the noise by which the support grows, and by which waves of the interpolation spread.
-REACH = float(np.sqrt(-2.0 * np.log(CUT)))
+REACH = 7.6  # standard deviations of the noise by which the support grows, and by which waves of the interpolation spread
 WIDENING = REACH
 FAR = 3.0  # ranges of a density that it moves in an interval, above which grids move with it
 DECAYED = 42.0  # -log of the factor of a mode that is negligible

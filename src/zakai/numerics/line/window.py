@@ -190,14 +190,13 @@ def grid_check(values: Array, closed: bool, negligible: float = CUT, cut: float 
     return GridCheck(left, right, int(first), int(last), negative, aliasing, rough, float(resolving))
 
 
-def fitted(check: GridCheck, window: Window, most: int = LARGEST, generous: int = 64, margin: float = 0.12) -> Window:
+def fitted(check: GridCheck, window: Window, most: int = LARGEST, generous: int = 64) -> Window:
     """Return the grid to go on with: the same where it serves, else one that fits the density.
 
     Args:
         check: the figures of the density.
         most: the largest size.
         generous: a grid of up to so many points is kept though fewer would do.
-        margin: range of a new grid beyond that of the density, relative to it.
     """
     needed = check.resolving * window.spacing
     if not 0.0 < needed < np.inf:  # the values are not finite
@@ -220,9 +219,7 @@ def fitted(check: GridCheck, window: Window, most: int = LARGEST, generous: int 
     needed = max(needed, window.spacing * width / (most - 12) * 1.12 * 2**0.25)
     low = window.centre + window.spacing * (first - window.size // 2)
     high = window.centre + window.spacing * (last - window.size // 2)
-    if margin * (high - low) / needed > 0.5 * (most - (high - low) / needed):
-        margin = 0.12
-    return quantized(window, low, high, needed, margin, most)
+    return quantized(window, low, high, needed, most=most)
 
 
 def enlarged(window: Window, left: bool, right: bool) -> Window:
