@@ -63,8 +63,6 @@ class Feed:
         start = float(model.start)
         self.now = Moment(start, 0.0, state, None, (0.0,) * self.m, (start,) * self.m, self.empty.notes)
 
-    @np.errstate(all="ignore")  # what is not finite is refused below
-    @one_thread
     def moved(self, time: float, values: list[float], inputs: Inputs | None = None) -> Moment:
         """Return the moment after an observation (m,), NaN where there is none; `now` stays as it is.
 
@@ -91,14 +89,15 @@ class Feed:
                 values = [value * span for value in values]
         if False in seen:
             values = [value if is_seen else 0.0 for value, is_seen in zip(values, seen)]
-        if self._kept is None:
-            prepared, notes = self._prepared(start, time, seen, elapsed, inputs)
-        else:
-            prepared, notes = self._kept(length, seen, elapsed)
-        try:
-            state, info = self.setting.method.step(prepared, 0, state, np.array(values))
-        except EscapeError as error:
-            raise error.moved(start) from None
+        with one_thread, np.errstate(all="ignore"):  # what is not finite is refused below
+            if self._kept is None:
+                prepared, notes = self._prepared(start, time, seen, elapsed, inputs)
+            else:
+                prepared, notes = self._kept(length, seen, elapsed)
+            try:
+                state, info = self.setting.method.step(prepared, 0, state, np.array(values))
+            except EscapeError as error:
+                raise error.moved(start) from None
         if not isfinite(info.log_likelihood_increment):
             raise InputError(
                 f"{self.setting.model.source}: at t = {time:.12g} the observation leaves nothing of the density, or takes it "
@@ -130,9 +129,10 @@ class Feed:
     ) -> tuple[Prepared, tuple[str, ...]]:
         """Return what is prepared for one interval, and what is to be reported of it."""
         setting = self.setting
-        observed = np.array([seen])
-        inputs = None if inputs is None else inputs.part(start, stop)
-        schedule = Schedule(np.array([start]), np.array([stop]), observed, np.where(observed, [elapsed], 0.0), inputs)
+        inputs, own = None if inputs is None else inputs.part(start, stop), elapsed
+        if False in seen:
+            own = tuple([one if is_seen else 0.0 for one, is_seen in zip(elapsed, seen)])
+        schedule = Schedule(np.array([start]), np.array([stop]), _row(seen, bool), _row(own, float), inputs)
         if inputs is not None or setting.method.for_interval is None:
             prepared = setting.method.prepare(setting.model, schedule, setting.theta, **setting.options)
         else:
@@ -148,6 +148,14 @@ class Feed:
                 prepared = setting.method.for_interval(known, schedule)
         noise = notes_on_noise(setting.model, schedule) if self._noise_varies else ()
         return prepared, (*noise, *prepared.notes)
+
+
+@lru_cache(KEPT)
+def _row(values: tuple[float, ...], kind: type) -> np.ndarray:
+    """Return the array (1, m) of the only row of a schedule, which is often the same."""
+    result: np.ndarray = np.array([values], kind)
+    result.setflags(write=False)
+    return result
 
 
 def _rounded(span: float, length: float) -> float:

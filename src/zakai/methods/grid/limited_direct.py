@@ -65,7 +65,7 @@ def prepare(
     prepared = line_filter.prepare(model, schedule, theta, tolerance_of(tolerance, 1e-9), in_pieces(model))
     prior = model.prior
     prepared = replace(
-        prepared, promised=1e-7 if tolerance is None else prepared.tolerance, generous=256 if model.periodic else 128,
+        prepared, promised=1e-7 if tolerance is None else prepared.tolerance,
         yau=yau_line_of(model), lie=splitting == "lie", series=power_series_of(model) if kernel == "power-series" else None,
         origin=float(prior.mean[0]) if isinstance(prior, GaussianPrior | MixturePrior) else 0.0,
     )  # fmt: skip

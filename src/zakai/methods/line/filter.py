@@ -13,7 +13,6 @@ Magnus' series of fourth order in adaptive substeps elsewhere.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -26,9 +25,8 @@ from zakai.methods.line.choice import predicted
 from zakai.methods.line.domain import check_ends, check_escape, on_the_line, variable_of
 from zakai.methods.line.model import system_of
 from zakai.methods.line.parts import parts_of_step, segment_of_parts
-from zakai.methods.line.prepared import SHARED, Parts, Prepared, State
+from zakai.methods.line.prepared import Parts, Prepared, State
 from zakai.methods.line.report import Report
-from zakai.methods.line.transition import ModalTransition
 from zakai.methods.line.update import (
     acting_inside,
     edge_of_moments,
@@ -51,8 +49,6 @@ from zakai.numerics.line.resolution import NOISE, noise_bound
 from zakai.records.schedule import Schedule
 
 SLOW = 1e-2  # of the tolerance: the spectrum that need not be resolved where f has kinks
-SLOW_GENEROUS = 256  # points of a grid that is retained though fewer would do
-GENEROUS = 96  # points of a grid that is retained though fewer would do
 PILED = 0.5  # density at an end of the grid, relative to the maximum, of a product that is cut off there
 
 
@@ -64,10 +60,7 @@ def prepare(model: Model, schedule: Schedule, theta: np.ndarray, tolerance: floa
     negligible = 1e-13 if system.samples else float(np.clip(1e-6 * tolerance, 1e-13, 1e-10))
     if system.kinked_drift and not pieces:  # the spectrum of a density falls slowly
         negligible = max(negligible, SLOW * tolerance)
-    generous = SHARED if system.samples and not system.moving else GENEROUS
-    result = Prepared(model, schedule, theta, system, tolerance, negligible, generous, tolerance, pieces=pieces)
-    # With kinks a grid is finer, and another one takes long to prepare.
-    return replace(result, generous=SLOW_GENEROUS) if result.kinked else result
+    return Prepared(model, schedule, theta, system, tolerance, negligible, tolerance, pieces=pieces)
 
 
 def for_interval(prepared: Prepared, schedule: Schedule) -> Prepared:
@@ -103,17 +96,10 @@ def segment(prepared: Prepared, rows: slice, state: State, observed: np.ndarray)
 
 
 class SingleStep(NamedTuple):
-    """The state after an interval that the compiled loop does not take, its report, and how the density came about.
-
-    That is its transition, where it is modal; the density after the observation on its own grid; and the parts of the interval,
-    if it was cut.
-    """
+    """The state after an interval that the compiled loop does not take, its report, and its parts if it was cut."""
 
     state: State
     info: Info
-    transition: ModalTransition | None
-    values: np.ndarray
-    window: lw.Window
     parts: Parts | None = None
 
 
@@ -165,14 +151,13 @@ def single(prepared: Prepared, k: int, state: State, observed: np.ndarray) -> Si
     parts = parts_of_step(prepared, k, values, window)
     if parts is not None:
         state, info = _of_parts(parts, 0, state, observed)
-        return SingleStep(state, info, None, np.asarray(state.values), state.window, parts)
-    transition: ModalTransition | None = None
+        return SingleStep(state, info, parts)
     _, before = lw.moments(values, window)  # the variance
     contraction = 1.0
     gained: Number = 0.0
     if length > 0:
         prediction, contraction = predicted(prepared, values, window, prepared.interval(k, inside, observed), report)
-        values, window, gained, check, transition = prediction
+        values, window, gained, check = prediction
     _, between = lw.moments(values, window)
     log_floor = float(state.log_floor)
     if report.positive:
@@ -196,9 +181,7 @@ def single(prepared: Prepared, k: int, state: State, observed: np.ndarray) -> Si
         report.density(check)
     elif check is None or prepared.kinked:
         check = grid_check(prepared, values, window)
-    # A large grid is retained only where its decomposition serves the next intervals too.
-    generous = prepared.generous if report.decomposed else min(prepared.generous, GENEROUS)
-    new_values, new, coarse = on_fitting_grid(prepared, values, window, check, generous)
+    new_values, new, coarse = on_fitting_grid(prepared, values, window, check, prepared.generous)
     if new != window and not prepared.weak:  # the largest grid may be too coarse for all that the density has
         report.aliasing = max(report.aliasing, coarse)
     mean, variance = lw.moments(values, window)
@@ -212,7 +195,7 @@ def single(prepared: Prepared, k: int, state: State, observed: np.ndarray) -> Si
     mean, variance = state_moments(prepared, values, window, mean, variance)
     log_floor = min(log_floor + max(report.depth - 1.0, 0.0), 0.0)
     info = Info(gained, np.array([mean]), np.array([[variance]]), health)
-    return SingleStep(State.of(new_values, new, error, log_floor), info, transition, values, window)
+    return SingleStep(State.of(new_values, new, error, log_floor), info)
 
 
 def _multiplied(

@@ -25,7 +25,7 @@ from zakai.numerics.arrays import Array
 from zakai.numerics.line import window as lw
 from zakai.numerics.line.backward import FEWEST, SMALLEST
 from zakai.numerics.line.density import support
-from zakai.numerics.line.resolution import SUPPORT, TRIALS
+from zakai.numerics.line.resolution import SUPPORT, TRIALS, noise_bound
 
 BULK = 1e-7  # of the maximum: there smaller values may be tails
 POINTS_OF_CURVATURE = 5  # points of a message that tell the curvature of its logarithm beyond an end
@@ -106,7 +106,6 @@ def placed(message: Message, centre: float, deviation: float, spacing: float, re
 
 
 WIDER_GRID = 1.2  # of a wider grid
-ROUGH = 1e-3  # of the tolerance that noise of psi may leave
 
 
 def by_moving_grid(
@@ -141,7 +140,7 @@ def by_moving_grid(
             continue
         check = lw.grid_check(propagated.values.real, False, accepted)
         made = max(check.aliasing, 0.1 * check.left, 0.1 * check.right)
-        if made <= min(accepted * 10.0**tried if not check.rough else 1.0, ROUGH * prepared.tolerance):
+        if made <= min(accepted * 10.0**tried if not check.rough else 1.0, noise_bound(prepared.tolerance)):
             error, noise, psi, tried = error + trial.error, max(noise, made), propagated, 0
             continue
         # Take another grid about psi, then wider and finer ones.

@@ -10,10 +10,7 @@ from zakai.methods.line.transition import Prediction
 from zakai.numerics.arrays import Array
 from zakai.numerics.line import window as lw
 from zakai.numerics.line.gaussian_kernels import WIDE, Channel, applied, around, chosen, wrapped
-from zakai.numerics.line.resolution import noise_bound
-
-NARROWEST_KERNEL = 1.4  # spacings that the standard deviation of a kernel must have
-MOST_GRIDS = 13
+from zakai.numerics.line.resolution import TRIALS, noise_bound
 
 
 def by_kernel(
@@ -52,7 +49,7 @@ def _along(
     """Return a density on the line after an interval."""
     yau, theta, cut, negligible = prepared.yau, prepared.theta, prepared.cut, prepared.negligible
     width, rough = np.sqrt(np.abs(kernel.variance.real)), noise_bound(prepared.tolerance)
-    if yau is None or not width > NARROWEST_KERNEL * window.spacing * abs(kernel.scale.real):
+    if yau is None or not width**2 > WIDE * (window.spacing * kernel.scale.real) ** 2:
         return None
     sources = window.offsets
     logs = np.log(np.where(values.real > 0, values, 0.0)) - yau.potential(window.points, start, theta)
@@ -60,7 +57,7 @@ def _along(
     top = float(np.max(np.where(np.isfinite(weights.real), weights.real, -np.inf)))
     weights = np.where(np.isfinite(weights.real), np.exp(weights - top), 0.0)
     new = window
-    for trial in range(MOST_GRIDS):
+    for trial in range(TRIALS):
         first = new.centre - new.spacing * (new.size // 2)
         result = applied(sources, first, new.spacing, new.size, weights, kernel.scale, kernel.shift, kernel.variance)
         result = result * new.spacing

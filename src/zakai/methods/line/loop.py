@@ -6,7 +6,7 @@ An interval that the loop refuses (an error above the tolerance, a gap in a path
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,45 +16,46 @@ from zakai.methods._states import Joined, StackedStates
 from zakai.methods.line import modal
 from zakai.methods.line.cache import Derived
 from zakai.methods.line.coefficients import misses_drift, on_grid_for_drift, sensor_at_nodes
+from zakai.methods.line.prepared import INTERVALS_TOGETHER as INTERVALS_TOGETHER
 from zakai.methods.line.prepared import Prepared, State
 from zakai.methods.line.update import edge_of_moments, grid_check, on_fitting_grid, outside_tables, resampled, state_moments
 from zakai.numerics.arrays import Array
+from zakai.numerics.line import steps as ls
 from zakai.numerics.line import window as lw
 from zakai.numerics.line.averages import GAUSS_NODES, parts_needed, probed
 from zakai.numerics.line.gaussian_kernels import BAND
 from zakai.numerics.line.loop import advance
 from zakai.numerics.line.modes_loop import OWN, PLACE, STAY
 from zakai.numerics.line.resolution import TRIALS
-from zakai.numerics.line.steps import CELL, COLUMNS, DRIFT, OBSERVED, PHI, SLOPE, TABLE_MARGIN, Grid, Segment, Start, Status
 
 BLOCK = 2048  # points by which the tables of a spacing are apart; a table has twice as many
 LOBATTO = np.array([0.0, 0.5 - 0.5 / np.sqrt(5.0), 0.5 + 0.5 / np.sqrt(5.0)])  # nodes within a spacing
 _NONE = np.zeros(0)
 
 
-def grid_of(prepared: Prepared, window: lw.Window, rows: slice) -> Grid | None:
+def grid_of(prepared: Prepared, window: lw.Window, rows: slice) -> ls.Grid | None:
     """Return what the loop knows of a grid, None where a formula has no value."""
     index, size = round(window.centre / window.spacing), window.size
     if window.closed:
         begin, length = 0, size
     elif prepared.mixed:
-        begin, length = index - size // 2 - TABLE_MARGIN, size + 2 * TABLE_MARGIN
+        begin, length = index - size // 2 - ls.TABLE_MARGIN, size + 2 * ls.TABLE_MARGIN
     else:
         begin, length = BLOCK * round(index / BLOCK) - BLOCK, 2 * BLOCK
     start = 0 if window.closed else index - size // 2 - begin
 
-    def make() -> tuple[Grid, np.ndarray]:
+    def make() -> tuple[ls.Grid, np.ndarray]:
         offsets = window.offsets if window.closed else window.spacing * (begin + np.arange(float(length)))
         x = window.origin + offsets
         table = _mixed(prepared, window, x, rows) if prepared.mixed else _separated(prepared, window, x)
         offset, fine = window.origin - prepared.origin + float(offsets[0]), _fine(prepared, window, x)
-        missing = ~np.isfinite(table[:, :, OBSERVED:]).all(axis=(0, 1, 2))
-        grid = Grid(table, 0, offset, window.spacing, fine)
+        missing = ~np.isfinite(table[:, :, ls.OBSERVED:]).all(axis=(0, 1, 2))
+        grid = ls.Grid(table, 0, offset, window.spacing, fine)
         return grid, np.append(0, np.cumsum(missing))
 
     key = window.origin, window.spacing, begin, length
     grid, missing = make() if prepared.mixed else prepared.once(Derived.TERMS, key, make)
-    return None if missing[start + size] > missing[start] else grid._replace(start=start)
+    return None if missing[start + size] > missing[start] else ls.Grid(grid.table, start, *grid[2:])
 
 
 def _separated(prepared: Prepared, window: lw.Window, x: np.ndarray) -> np.ndarray:
@@ -62,11 +63,11 @@ def _separated(prepared: Prepared, window: lw.Window, x: np.ndarray) -> np.ndarr
     system, start, theta = prepared.system, prepared.model.start, prepared.theta
     assert system.separated is not None
     parts = np.moveaxis(system.separated[1](_nodes(window, x), start, theta), 0, -1)
-    table = np.zeros((1, len(parts), OBSERVED + system.m, len(x)), theta.dtype)
-    table[0, :, CELL] = _cells(window, parts[:, 0])
-    table[0, :, DRIFT:] = parts[..., :-1:3]
+    table = np.zeros((1, len(parts), ls.OBSERVED + system.m, len(x)), theta.dtype)
+    table[0, :, ls.CELL] = _cells(window, parts[:, 0])
+    table[0, :, ls.DRIFT:] = parts[..., :-1:3]
     if prepared.yau is not None:
-        table[0, 0, PHI] = prepared.yau.potential(x, start, theta)
+        table[0, 0, ls.PHI] = prepared.yau.potential(x, start, theta)
     return table
 
 
@@ -98,12 +99,12 @@ def _mixed(prepared: Prepared, window: lw.Window, x: np.ndarray, rows: slice) ->
     starts, stops = prepared.schedule.starts[rows, None], prepared.schedule.stops[rows, None]
     inner = np.clip(starts + prepared.lengths[rows, None] * GAUSS_NODES, starts, np.nextafter(stops, starts))
     times = np.concatenate([inner, stops], axis=1)
-    table = np.zeros((*times.shape, OBSERVED + system.m, len(x)), theta.dtype)
+    table = np.zeros((*times.shape, ls.OBSERVED + system.m, len(x)), theta.dtype)
     f = system.drift(_nodes(window, x), times[..., None], theta)[..., 0]
-    table[..., CELL, :], table[..., DRIFT, :] = _cells(window, f), f[..., :-1:3]
+    table[..., ls.CELL, :], table[..., ls.DRIFT, :] = _cells(window, f), f[..., :-1:3]
     assert system.slope is not None
-    table[..., SLOPE, :] = system.slope(x[:, None], times[..., None], theta)[..., 0]
-    table[..., OBSERVED:, :] = np.moveaxis(system.observation(x[:, None], times[..., None], theta), -1, 2)
+    table[..., ls.SLOPE, :] = system.slope(x[:, None], times[..., None], theta)[..., 0]
+    table[..., ls.OBSERVED:, :] = np.moveaxis(system.observation(x[:, None], times[..., None], theta), -1, 2)
     at = window.points[:: max(1, window.size // 8), None]
 
     def coefficients(t: np.ndarray) -> np.ndarray:
@@ -113,20 +114,14 @@ def _mixed(prepared: Prepared, window: lw.Window, x: np.ndarray, rows: slice) ->
         return np.concatenate([f, system.observation(at, t[..., None], theta).reshape(*t.shape, -1)], axis=-1)
 
     known = coefficients(times[:, :count])
-    table[parts_needed(coefficients(probed(starts, stops)), known) != 1, :, :OBSERVED] = np.nan
+    table[parts_needed(coefficients(probed(starts, stops)), known) != 1, :, :ls.OBSERVED] = np.nan
     return table
 
 
-LARGER = 0.2  # margin of a new grid, relative to the range of the density
-INTERVALS_TOGETHER = 32  # intervals whose tables of coefficients in time are computed together
 HEALTH = {
-    "edge_mass": "edge",
-    "negative_mass": "negative",
-    "aliasing": "aliasing",
-    "time_error": "time",
-    "tail_depth": "depth",
-    "error_estimate": "error",
-}
+    "edge_mass": ls.EDGE, "negative_mass": ls.NEGATIVE, "aliasing": ls.ALIASING, "time_error": ls.TIME, "tail_depth": ls.DEPTH,
+    "error_estimate": ls.ERROR,
+}  # fmt: skip
 
 
 class Piece(NamedTuple):
@@ -153,7 +148,7 @@ class Piece(NamedTuple):
     @property
     def states(self) -> Sequence[State]:
         """The states after the steps."""
-        errors, floors = self.reports[:, ERROR], self.reports[:, FLOOR]
+        errors, floors = self.reports[:, ls.ERROR], self.reports[:, ls.LOG_FLOOR]
         fields = {
             "values": self.densities, "centre": self.centres, "spacing": self.spacings, "error": errors, "log_floor": floors
         }  # fmt: skip
@@ -162,14 +157,10 @@ class Piece(NamedTuple):
     @classmethod
     def of(cls, first: int, before: State, densities: Array, centres: Array, spacings: Array, reports: Array) -> Piece:
         """Return steps after which the grid stays."""
-        error, log_floor = float(reports[-1, ERROR]), float(reports[-1, FLOOR])
+        error, log_floor = float(reports[-1, ls.ERROR]), float(reports[-1, ls.LOG_FLOOR])
         centre, spacing = float(centres[-1]), float(spacings[-1])
         last = before._replace(values=densities[-1], centre=centre, spacing=spacing, error=error, log_floor=log_floor)
         return cls(first, before, densities, centres, spacings, reports, last)
-
-
-START, ERROR, FLOOR = (COLUMNS.index(name) for name in ("start", "error", "log_floor"))
-DIVIDED = [COLUMNS.index(name) for name in ("pairs", "substeps", "needed")]  # what a splitting was
 
 
 def infos_of(prepared: Prepared, pieces: Sequence[Piece]) -> Infos:
@@ -188,7 +179,7 @@ def one(prepared: Prepared, k: int, state: State, observed: np.ndarray) -> tuple
         return None
     first = pieces[0]
     place = first.before.origin, float(first.centres[0]), float(first.spacings[0])
-    return first.last, _info(prepared, k, first.last, place, first.reports[0])
+    return first.last, _info(prepared, k, first.last, place, first.reports[0].tolist())
 
 
 def _single(prepared: Prepared, k: int, state: State, observed: np.ndarray) -> tuple[State, Info] | None:
@@ -199,18 +190,18 @@ def _single(prepared: Prepared, k: int, state: State, observed: np.ndarray) -> t
     grid = grid_of(prepared, window, slice(k, k + 1))
     if grid is None:
         return None
-    start = Start(np.ascontiguousarray(state.values), float(state.error), float(state.log_floor))
+    start = ls.Start(np.ascontiguousarray(state.values), float(state.error), float(state.log_floor))
     observed = np.ascontiguousarray(observed[None], float)
     segment = advance(prepared.mechanisms, start, grid, prepared.steps, k, observed, prepared.limits)
     if not len(segment.reports):
         return None
-    report, origin, spacing = segment.reports[0], state.origin, float(state.spacing)
-    centre = spacing * (round(state.centre / spacing) + (float(report[START]) - grid.start))
-    error, log_floor = float(report[ERROR]), float(report[FLOOR])
+    figures, origin, spacing = segment.reports[0].tolist(), state.origin, float(state.spacing)
+    centre = spacing * (round(state.centre / spacing) + (figures[ls.START] - grid.start))
+    error, log_floor = figures[ls.ERROR], figures[ls.LOG_FLOOR]
     state = State(segment.densities[0], origin, centre, spacing, state.unit, state.closed, error, log_floor)
-    if segment.status == Status.AFTER:
+    if segment.status == ls.Status.AFTER:
         state = regridded(prepared, state)
-    return state, _info(prepared, k, state, (origin, centre, spacing), report)
+    return state, _info(prepared, k, state, (origin, centre, spacing), figures)
 
 
 def compiled_steps(prepared: Prepared, rows: slice, state: State, observed: np.ndarray) -> list[Piece]:
@@ -235,44 +226,44 @@ def compiled_steps(prepared: Prepared, rows: slice, state: State, observed: np.n
             status, answer = result.status, result.answer
             piece = Piece.of(first, state, *result[:4])._replace(coarse=result.coarse) if len(result.reports) else None
         if piece is not None:
-            if status == Status.AFTER or prepared.cut_up:
+            if status == ls.Status.AFTER or prepared.cut_up:
                 piece = piece._replace(last=regridded(prepared, piece.last))
             pieces.append(piece)
             trials, state, first = 1, piece.last, first + len(piece.reports)
-        if status == Status.FAILED or (status == Status.OK and piece is None):
+        if status == ls.Status.FAILED or (status == ls.Status.OK and piece is None):
             break
-        if status == Status.RANGE:
+        if status == ls.Status.RANGE:
             larger = _covering(prepared, state, *answer.tolist())
             if larger is None:
                 break
             state = larger
-        if placement == STAY and status in (Status.NARROW, Status.UNRESOLVED):
+        if placement == STAY and status in (ls.Status.NARROW, ls.Status.UNRESOLVED):
             if prepared.kinked:
                 break
-            placement = PLACE if status == Status.NARROW else OWN
-        elif status == Status.BROAD or placement == OWN:
+            placement = PLACE if status == ls.Status.NARROW else OWN
+        elif status == ls.Status.BROAD or placement == OWN:
             placement = STAY
     return pieces
 
 
 def _on_one_table(
     prepared: Prepared, rows: slice, state: State, window: lw.Window, observed: np.ndarray
-) -> tuple[Piece | None, Status, Array]:
+) -> tuple[Piece | None, ls.Status, Array]:
     """Return the first steps of `rows` by kernels or splitting, why they end, and the grid that is needed."""
     together = 1 if prepared.cut_up else INTERVALS_TOGETHER if prepared.mixed else len(observed)
     here = slice(rows.start, min(rows.stop, rows.start + together))
     grid = grid_of(prepared, window, here)
     if grid is None:
-        return None, Status.FAILED, np.zeros(3)
-    start = Start(np.ascontiguousarray(state.values), float(state.error), float(state.log_floor))
+        return None, ls.Status.FAILED, np.zeros(3)
+    start = ls.Start(np.ascontiguousarray(state.values), float(state.error), float(state.log_floor))
     segment = advance(prepared.mechanisms, start, grid, prepared.steps, rows.start, observed[:together], prepared.limits)
     return (_piece(rows.start, state, grid.start, segment) if len(segment.reports) else None), segment.status, segment.answer
 
 
-def _piece(first: int, before: State, start: int, segment: Segment) -> Piece:
+def _piece(first: int, before: State, start: int, segment: ls.Segment) -> Piece:
     """Return the steps of a grid that begins at a point of its table: centres are multiples of the spacing."""
     spacing = before.spacing
-    centres = spacing * (round(before.centre / spacing) + (segment.reports[:, START] - start))
+    centres = spacing * (round(before.centre / spacing) + (segment.reports[:, ls.START] - start))
     return Piece.of(first, before, segment.densities, centres, np.full(len(centres), spacing), segment.reports)
 
 
@@ -283,7 +274,7 @@ def _covering(prepared: Prepared, state: State, low: float, high: float, spacing
         size = lw.size_for(2 * np.pi / spacing)
         new = window._replace(size=size, spacing=2 * np.pi / size)
     else:
-        new = lw.quantized(window, low + window.centre, high + window.centre, spacing, LARGER, prepared.largest_for())
+        new = lw.quantized(window, low + window.centre, high + window.centre, spacing, most=prepared.largest_for())
         if new.spacing * new.size < high - low:
             return None
     if new == window:
@@ -298,7 +289,7 @@ def regridded(prepared: Prepared, state: State) -> State:
     check = grid_check(prepared, values, window)
     if prepared.gaussian:
         check = check._replace(resolving=check.resolving * BAND / 0.92)
-    new_values, new, _ = on_fitting_grid(prepared, np.asarray(values), window, check, prepared.generous, LARGER)
+    new_values, new, _ = on_fitting_grid(prepared, np.asarray(values), window, check, prepared.generous)
     return state if new == window else state._replace(values=new_values, centre=new.centre, spacing=new.spacing)
 
 
@@ -309,38 +300,37 @@ def _infos(prepared: Prepared, piece: Piece) -> Infos:
     def each(function: Callable[[State, float], Any]) -> np.ndarray:
         return np.array([function(*pair) for pair in zip(states, stops)])
 
-    columns, origin = dict(zip(COLUMNS, piece.reports.T)), piece.before.origin
-    mean, variance, health = _report(prepared, (origin, piece.centres, piece.spacings), columns, each)
-    return Infos(columns["gained"], mean[:, None], variance[:, None, None], health)
+    place = piece.before.origin, piece.centres, piece.spacings
+    mean, variance, health = _report(prepared, place, list(piece.reports.T), each)
+    return Infos(piece.reports[:, ls.GAINED], mean[:, None], variance[:, None, None], health)
 
 
-def _info(prepared: Prepared, k: int, state: State, place: Place, report: Array) -> Info:
+def _info(prepared: Prepared, k: int, state: State, place: Place, figures: list[float]) -> Info:
     """Return the report of interval k, after which the state is this one."""
 
     def each(function: Callable[[State, float], Any]) -> np.ndarray:
         return np.asarray(function(state, float(prepared.schedule.stops[k])))
 
-    columns = dict(zip(COLUMNS, report.tolist()))
-    mean, variance, health = _report(prepared, place, columns, each)
-    return Info(columns["gained"], np.array([mean]), np.array([[variance]]), health)
+    mean, variance, health = _report(prepared, place, figures, each)
+    return Info(figures[ls.GAINED], np.array([mean]), np.array([[variance]]), health)
 
 
 Place = tuple[Any, Any, Any]  # the origin, the centres and the spacings of the grids of steps
 
 
 def _report(
-    prepared: Prepared, place: Place, columns: Mapping[str, Any], each: Callable[[Callable[[State, float], Any]], np.ndarray]
+    prepared: Prepared, place: Place, figures: Sequence[Any], each: Callable[[Callable[[State, float], Any]], np.ndarray]
 ) -> tuple[Any, Any, dict[str, Any]]:
     """Return the mean, the variance and the health figures of steps, as arrays (K,), or as the numbers of a single one.
 
-    `each` applies a function to the state after every step and the time.
+    `figures` are those of their reports, and `each` applies a function to the state after every step and the time.
     """
     origin, centre, spacing = place
-    mean = origin + (centre + spacing * columns["mean"])
-    variance = spacing**2 * columns["variance"]
-    health = {name: columns[source] for name, source in HEALTH.items()}
-    health["tolerance_ratio"] = columns["made"] / prepared.promised
-    health["std_in_spacings"] = np.sqrt(columns["variance"])
+    mean = origin + (centre + spacing * figures[ls.MEAN])
+    variance = spacing**2 * figures[ls.VARIANCE]
+    health = {name: figures[i] for name, i in HEALTH.items()}
+    health["tolerance_ratio"] = figures[ls.MADE] / prepared.promised
+    health["std_in_spacings"] = np.sqrt(figures[ls.VARIANCE])
     if prepared.model.domain:
         mean, variance = each(lambda one, t: state_moments(prepared, one.values, one.window, 0.0, 0.0)).T
         edges = each(lambda one, t: edge_of_moments(prepared, one.values, one.window))
@@ -349,7 +339,7 @@ def _report(
         ):  # fmt: skip
             health[name] = np.maximum(health[name], edge)
     if prepared.system.general:
-        health["without_law"] = 0.0 * columns["made"]
+        health["without_law"] = 0.0 * figures[ls.MADE]
     if prepared.system.tabulated:
         health["outside_tables"] = each(lambda one, t: outside_tables(prepared, one.values, one.window, t))
     return mean, variance, health

@@ -17,15 +17,13 @@ from zakai.methods.line.prepared import Prepared, State
 from zakai.numerics.arrays import Array
 from zakai.numerics.line import window as lw
 from zakai.numerics.line.backward import FEWEST
+from zakai.numerics.line.modes import FALL
 from zakai.numerics.line.operator import Spectral
 from zakai.numerics.line.window import local_polynomial
 
-FALL = 3.3  # spacings over which F falls
-HALF = 14.0  # spacings from where F is one to where it is one half
-PAD = 28  # spacings over which F falls to zero
-SIZE_STEP = 16  # larger grids have a multiple of so many points: few different sizes
+PAD = 28  # spacings over which F falls from one to zero
 SURE_OF_DENSITY = 10.0  # errors of a density from which its small values count
-LOWEST = -30.0  # logarithm of the largest error of small values, relative to the largest value
+LOWEST = float(np.log(lw.CUT))  # of the largest error of small values, relative to the largest value
 
 
 class Message(NamedTuple):
@@ -107,7 +105,7 @@ def taper(offsets: Array, ends: tuple[float, float], spacing: float) -> Array:
     from scipy.special import erfc
 
     beyond = np.maximum(ends[0] - offsets, offsets - ends[1]) / spacing
-    return np.asarray(0.5 * erfc((beyond - HALF) / FALL))
+    return np.asarray(0.5 * erfc(FALL * (2.0 * beyond / PAD - 1.0)))
 
 
 def points_of(window: lw.Window, low: float, high: float, spacing: float) -> lw.Window:
@@ -118,7 +116,8 @@ def points_of(window: lw.Window, low: float, high: float, spacing: float) -> lw.
     spacing = lw.quantized(window, low, high, spacing).spacing
     first, last = np.floor(low / spacing + 1e-9), np.ceil(high / spacing - 1e-9)
     size = max(int(last - first) + 1, FEWEST)
-    size = size if size < 4 * SIZE_STEP else SIZE_STEP * -(-size // SIZE_STEP)
+    step = 2 * lw.ALIGNMENT  # large grids have few different sizes
+    size = size if size < 4 * step else step * -(-size // step)
     return window._replace(centre=float((first + size // 2) * spacing), spacing=spacing, size=size)
 
 
@@ -135,10 +134,11 @@ def _fall(size: int) -> tuple[Array, Array]:
     from scipy.special import erfcx
 
     i = np.arange(size)
-    y = (np.maximum(PAD - i, PAD - i[::-1]) - HALF) / FALL
+    rate = 2.0 * FALL / PAD
+    y = rate * np.maximum(PAD - i, PAD - i[::-1]) - FALL
     with np.errstate(over="ignore"):
-        slope = -2.0 / (np.sqrt(np.pi) * erfcx(y)) / FALL  # of log(erfc(y) / 2)
-    return slope * np.where(i < size / 2, -1.0, 1.0), -slope * (2.0 * y / FALL + slope)
+        slope = -2.0 / (np.sqrt(np.pi) * erfcx(y)) * rate  # of log(erfc(y) / 2)
+    return slope * np.where(i < size / 2, -1.0, 1.0), -slope * (2.0 * y * rate + slope)
 
 
 def gauged(prepared: Prepared, window: lw.Window) -> Spectral | None:

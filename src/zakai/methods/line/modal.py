@@ -19,20 +19,18 @@ import numpy as np
 
 from zakai.methods.line.cache import CacheKey, Derived
 from zakai.methods.line.coefficients import covariance_at, gauge_at, profile_of, sensor_at_nodes, spectral
-from zakai.methods.line.prepared import SHARED, Prepared, State
+from zakai.methods.line.prepared import INTERVALS_TOGETHER, SHARED, Prepared, State
 from zakai.methods.line.update import factor_at_end, grid_check
 from zakai.numerics.arrays import Array
 from zakai.numerics.line import modes_loop as lm
 from zakai.numerics.line import window as lw
 from zakai.numerics.line.density import circular_rows, waves
-from zakai.numerics.line.grid_choice import PER, SPACING, WIDENING, coarse_grid
-from zakai.numerics.line.modes import KnownGrids, Start
+from zakai.numerics.line.grid_choice import PER, REACH, SPACING, coarse_grid
+from zakai.numerics.line.modes import KnownGrids, Start, gathered
 from zakai.numerics.line.product import General, weaken
 from zakai.numerics.line.resolution import TRIALS, edge_bound, rounding_bound, spectrum_bound
-from zakai.numerics.line.steps import COLUMNS, STATUSES, Status
+from zakai.numerics.line.steps import FIGURES, STATUSES, Status
 
-ROWS_TOGETHER = 8  # intervals whose likelihoods are computed together
-NEW = 12  # coarse grids and rows that are made for one step
 FINE_SIZES = (80, 160, 384, 1024)  # points of fine grids
 NUMBERS = 2**21  # of the grids that are known together
 
@@ -90,11 +88,11 @@ def advanced(prepared: Prepared, k: int, stop: int, state: State, observed: np.n
     coarse, rows, at = prepared.once(Derived.COARSE_GRIDS, key, Coarse), np.empty((0, 0, 0)), 0
     start = Start(np.ascontiguousarray(state.values), float(state.centre), float(state.spacing), float(state.error))
     frame = lm.Frame(window.unit, window.closed, profile)
-    owner, count = (-2, stop - k) if not special else (-1, min(ROWS_TOGETHER, stop - k) if stays else 1)
-    for _ in range(NEW):
+    owner, count = (-2, stop - k) if not special else (-1, min(INTERVALS_TOGETHER, stop - k) if stays else 1)
+    for _ in range(TRIALS):
         n = window.size if stays else FINE_SIZES[at]
         cosines, sines = waves(n)
-        densities, places, out = np.empty((count, n)), np.empty((count + 1, 4)), np.zeros((count, len(COLUMNS)))
+        densities, places, out = np.empty((count, n)), np.empty((count + 1, 4)), np.zeros((count, FIGURES))
         samples = lm.Samples(k, observed[:count], steps.lengths, steps.precisions[:, 0], steps.constants)
         done, number = lm.advance(
             start, frame, KnownGrids(coarse.numbers, coarse.index), lm.Special(rows, owner, general), placement, samples,
@@ -190,17 +188,8 @@ def _points(grid: lw.Window) -> Array:
 SHARP = 2.0  # how much finer a grid is at least
 
 
-class Coarsened(NamedTuple):
-    """A density (N,) on a coarse grid, its error, and the numbers of points at the two ends at which there is no density."""
-
-    values: Array
-    window: lw.Window
-    error: float
-    margins: tuple[int, int]
-
-
-def coarsened(prepared: Prepared, values: Array, window: lw.Window, length: float) -> Coarsened | None:
-    """Return the density after an interval without observations inside; None where no coarse grid serves.
+def coarsened(prepared: Prepared, values: Array, window: lw.Window, length: float) -> tuple[Array, lw.Window, float] | None:
+    """Return the density after an interval without observations inside, its grid and its error; None where no coarse grid serves.
 
     Args:
         prepared: a system without coefficients in time.
@@ -217,9 +206,9 @@ def coarsened(prepared: Prepared, values: Array, window: lw.Window, length: floa
         return None
     spacing = window.unit * 2.0 ** np.floor(np.log2(SPACING * deviation / window.unit) + 1e-9)
     wide = float(np.sqrt(np.max(covariance.real) * length))
-    low, high = window.offsets[check.first] - WIDENING * wide, window.offsets[check.last] + WIDENING * wide
+    low, high = window.offsets[check.first] - REACH * wide, window.offsets[check.last] + REACH * wide
     for _ in range(TRIALS):
-        centre, spacing, size = coarse_grid(low, high, spacing, WIDENING * wide)
+        centre, spacing, size = coarse_grid(low, high, spacing, REACH * wide)
         if not size <= lw.LARGEST or spacing < SHARP * window.spacing:
             return None
         coarse = window._replace(centre=float(centre), spacing=float(spacing), size=int(size))
@@ -230,7 +219,7 @@ def coarsened(prepared: Prepared, values: Array, window: lw.Window, length: floa
             scale = np.exp(_gauge(prepared, coarse, points) - decomposed.top)
             if np.ndim(covariance):
                 scale = scale / np.sqrt(covariance)
-            result, error = decomposed.carried(lw.gathered(retained / scale, window.offsets[inner], coarse), length)
+            result, error = decomposed.carried(gathered(retained / scale, window.offsets[inner], coarse), length)
         trusted = (coarse.offsets >= low) & (coarse.offsets <= high)
         ends = np.flatnonzero(trusted)[[0, 1, -2, -1]]
         result = np.where(trusted, result, 0.0)
@@ -245,7 +234,7 @@ def coarsened(prepared: Prepared, values: Array, window: lw.Window, length: floa
         elif error > rounding_bound(prepared.tolerance):
             return None
         else:
-            return Coarsened(result, coarse, error, (int(ends[0]), coarse.size - 1 - int(ends[-1])))
+            return result, coarse, error
     return None
 
 

@@ -31,8 +31,9 @@ class Formulas(NamedTuple):
 
     `slope` is f', `spread` G' and G''; `cross` is g C with its derivative and h' (3, m), None for independent noises.
     `separated` are the functions a (R,) of t and g (R, 2 + m) of x with (f, f', h) = sum a_r g_r; `kinks` (K,) are zero where
-    f, G or an h that acts within intervals has a kink or a jump.  `resolved` tells that the six Gauss nodes of an interval
-    resolve all coefficients in time that act within it: polynomials of t of degree five at most.
+    f, G or an h that acts within intervals has a kink or a jump.  `polynomials` (D, R) are the coefficients of the factors a, the
+    highest power of t first, None unless all coefficients in time that act within an interval are polynomials of t of degree five
+    at most: the six Gauss nodes resolve them.
     """
 
     drift: Function
@@ -45,7 +46,7 @@ class Formulas(NamedTuple):
     outside: OutsideTables
     separated: tuple[Function, Function] | None
     kinks: Function | None
-    resolved: bool
+    polynomials: Function | None
 
 
 @once_for_a_model
@@ -69,7 +70,7 @@ def _formulas(model: Model) -> Formulas:
             numpy_function(list(terms), model, (len(terms),)), numpy_function(_terms_of_x(terms, x), model, (len(terms), 2 + m))
         ),
         numpy_function(roots, model, (len(roots),)) if (roots := _roots(model)) else None,
-        terms is not None and _resolved(model, [*terms, G]),
+        _polynomials(model, list(terms)) if terms is not None and _resolved(model, [*terms, G]) else None,
     )
 
 
@@ -142,6 +143,14 @@ def _resolved(model: Model, coefficients: list[sp.Expr]) -> bool:
     return steady and all(
         not part.free_symbols & set(model.u) and part.is_polynomial(model.t) and sp.degree(part, model.t) <= 5 for part in varying
     )
+
+
+def _polynomials(model: Model, factors: list[sp.Expr]) -> Function:
+    """Return the coefficients of polynomials of t, the highest power of t first."""
+    columns = [sp.Poly(factor, model.t).all_coeffs() for factor in factors]
+    count = max(2, *map(len, columns))
+    rows = [[column[i - count] if i >= count - len(column) else sp.Integer(0) for column in columns] for i in range(count)]
+    return numpy_function(sp.Matrix(rows), model, (count, len(factors)))
 
 
 _MOST_TERMS = 8
@@ -247,7 +256,7 @@ class System:
         self.slope, self.spread = self._optional(formulas.slope), self._optional(formulas.spread)
         self.cross, self.kinks = self._optional(formulas.cross), self._optional(formulas.kinks)
         self.separated = None if formulas.separated is None else (self._bound(formulas.separated[0]), formulas.separated[1])
-        self.resolved = formulas.resolved
+        self.polynomials, self.resolved = formulas.polynomials, formulas.polynomials is not None
         self.tabulated, self._outside = bool(formulas.outside), self._bound(formulas.outside)
 
     def _bound(self, function: Function) -> Function:

@@ -26,9 +26,9 @@ from zakai.methods.line.prepared import Prepared, State
 from zakai.numerics.arrays import Array
 from zakai.numerics.complex_step import STEP
 from zakai.numerics.line import window as lw
+from zakai.numerics.line.resolution import RESOLVED
 from zakai.numerics.line.window import local_polynomial
 
-RELIABLE_DENSITY = 1e-10  # of the maximum: a density whose derivative is not rounding
 NARROW_LAW = 0.02  # ratio of deviations below which skewness and kurtosis are zero but for rounding
 WIDEST_ANGLE = 0.5  # conditional deviation of an angle for which two waves do not suffice
 
@@ -80,7 +80,7 @@ def _law(prepared: Prepared, k: int, values: Array, state: State) -> tuple[Law, 
         ratio = propagated.values.imag / propagated.values.real
         means.append((ratio + np.imag(info.log_likelihood_increment)) / STEP)
     window, q = propagated.window, propagated.values.real
-    reliable = np.flatnonzero(q > RELIABLE_DENSITY * np.max(q))
+    reliable = np.flatnonzero(q > RESOLVED * np.max(q))
     ends = float(window.offsets[reliable[0]]), float(window.offsets[reliable[-1]])
     if own.closed:
         return _of_waves(means[0] + 1j * means[1], means[2] + 1j * means[3], window), window, ends

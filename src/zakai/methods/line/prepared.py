@@ -24,15 +24,15 @@ from zakai.models.prior import GaussianPrior
 from zakai.numerics.arrays import Array
 from zakai.numerics.complex_step import log_determinant
 from zakai.numerics.line import window as lw
-from zakai.numerics.line.averages import GAUSS_NODES, parts_needed, probed
+from zakai.numerics.line.averages import GAUSS_NODES, parts_needed, polynomials_at_nodes, probed
 from zakai.numerics.line.gaussian_kernels import kernel_size, packed
-from zakai.numerics.line.resolution import GROSS
+from zakai.numerics.line.resolution import GROSS, MAGNUS
 from zakai.numerics.line.steps import FACTOR, KERNEL, SPLIT, SPLIT_FACTOR, Limits, Mechanisms, Steps
 from zakai.records.schedule import Schedule, lengths_of
 
 T = TypeVar("T")
-KERNEL_SHARE = 2e-2  # of the promised error that the splitting of one interval may leave in `limited-direct`
 SHARE = 5e-3  # of the tolerance that the splitting of one interval may leave
+INTERVALS_TOGETHER = 32  # intervals whose tables of coefficients in time, or likelihoods, are computed together
 SHARED = 128  # points of the largest grid on which many steps share a decomposition
 ROUNDS = 2  # of cutting, after which what is not resolved is left to adaptive substeps
 _X = np.zeros(1)
@@ -106,9 +106,9 @@ class Prepared:
     """What is known without data.
 
     `tolerance` is what substeps are chosen for, `promised` the error of a step above which a result warns; `negligible` the
-    spectrum that need not be resolved; `generous` the size of a grid that is retained though fewer points would do; `pieces`
-    whether densities are polynomials between ends and kinks; `grid_cache` holds what was computed for single grids; `shares` (K,)
-    are those of parts in the time of their intervals, and `cut_up` whether these are parts of one interval.
+    spectrum that need not be resolved; `pieces` whether densities are polynomials between ends and kinks; `grid_cache` holds what
+    was computed for single grids; `shares` (K,) are those of parts in the time of their intervals, and `cut_up` whether these are
+    parts of one interval.
     """
 
     model: Model
@@ -117,7 +117,6 @@ class Prepared:
     system: System
     tolerance: float
     negligible: float
-    generous: int
     promised: float
     yau: YauLine | None = None
     lie: bool = False
@@ -140,15 +139,17 @@ class Prepared:
         """Return the same for another interval with the same sensors, where only its length and coefficients in time are new."""
         if not self.timed or self.kernels is not None or self.parts is not None or not self.fast[0]:
             return self.over(schedule)
-        lengths = schedule.lengths
-        result = object.__new__(Prepared)
-        vars(result).update(vars(self), schedule=schedule, lengths=lengths)
-        c = coefficients_of(result, self.coefficients)
-        if c.parts[0] != 1:
-            return self.over(schedule)
-        kinds, _, shares, _, _, kernels, *_ = self.steps
-        steps = Steps(kinds, lengths, shares, c.precisions, c.constants, kernels, c.drifts, c.outputs, c.covariances)
-        vars(result).update(coefficients=c, steps=steps)
+        result, system, lengths = object.__new__(Prepared), self.system, schedule.lengths
+        known, before, (kinds, _, shares, _, _, kernels, *_) = vars(result), self.coefficients, self.steps
+        known.update(vars(self), schedule=schedule, lengths=lengths)
+        if system.resolved and system.steady_covariance and system.steady_noise and not system.samples:
+            factors = polynomials_at_nodes(self.polynomials, schedule.starts, schedule.stops, lengths)  # only these are new
+            c = CoefficientsInTime(factors[:, :-1], factors[:, : before.outputs.shape[1]], *before[2:])
+        else:
+            c = coefficients_of(result, before)
+            if c.parts[0] != 1:
+                return self.over(schedule)
+        known.update(coefficients=c, steps=Steps(kinds, lengths, shares, *c[3:5], kernels, *c[:3]))
         return result
 
     @cached_property
@@ -246,6 +247,12 @@ class Prepared:
         return 1e-32 if self.system.samples else lw.DEEP
 
     @cached_property
+    def polynomials(self) -> np.ndarray:
+        """The factors of the terms of f and h where they are polynomials of t (D, R), the highest power first, else nothing."""
+        function = self.system.polynomials
+        return np.zeros((0, 0)) if function is None else function(_X, self.model.start, self.theta)
+
+    @cached_property
     def coefficients(self) -> CoefficientsInTime:
         """The coefficients in time of all intervals."""
         return coefficients_of(self)
@@ -259,6 +266,12 @@ class Prepared:
     def largest(self) -> int:
         """The points of the largest grid of the compiled loop, and of any grid where a larger one does not help."""
         return lw.LARGE if self.gaussian else lw.LARGEST
+
+    @property
+    def generous(self) -> int:
+        """The size of a grid that is retained though fewer points would do."""
+        size = 2 * SHARED if self.kinked else SHARED  # with kinks a grid is finer, and another one takes long to prepare
+        return lw.LARGE if self.timed and self.model.periodic else size
 
     def largest_for(self, check: lw.GridCheck | None = None, size: int = 0) -> int:
         """Return the points of the largest grid for a density with some figures on a grid of some size.
@@ -285,10 +298,9 @@ class Prepared:
     @cached_property
     def limits(self) -> Array:
         """What a step of the compiled loop must keep, as the fields of `steps.Limits`."""
-        splitting = SHARE * self.tolerance if self.yau is None else KERNEL_SHARE * self.promised
-        generous = lw.LARGE if self.timed and self.model.periodic else self.generous
+        splitting = SHARE * self.tolerance if self.yau is None else MAGNUS * self.promised
         finest = 512.0 if self.system.samples else 256.0
-        return np.array(Limits(self.negligible, self.promised, splitting, self.cut, generous, finest), float)
+        return np.array(Limits(self.negligible, self.promised, splitting, self.cut, self.generous, finest), float)
 
     @cached_property
     def mechanisms(self) -> Mechanisms:
@@ -302,8 +314,7 @@ class Prepared:
     @cached_property
     def fast(self) -> list[bool]:
         """Which intervals (K,) the compiled loop may take."""
-        result: list[bool] = (self.kinds >= 0).tolist()
-        return result
+        return list((self.kinds >= 0).tolist())
 
     def deepest(self, floor: float) -> float:
         """Return the depth of the tails, as a logarithm below the maximum, to which a density with this floor is accurate."""
@@ -326,17 +337,14 @@ class Prepared:
 
 
 # What of a `Prepared` does not depend on its schedule: what is computed, and with it the fields.
-STEADY = ("divides", "gaussian", "timed", "weak", "mixed", "cut", "limits")
+STEADY = ("divides", "gaussian", "timed", "weak", "mixed", "cut", "limits", "polynomials")
 FIELDS = (*(field.name for field in fields(Prepared)), *STEADY)
 
 
 def coefficients_of(prepared: Prepared, steady: CoefficientsInTime | None = None) -> CoefficientsInTime:
     """Return what the loop needs of the coefficients in time of all intervals; of one, `steady` has those that are constant."""
     schedule, system, theta = prepared.schedule, prepared.system, prepared.theta
-    resolved = system.resolved and not prepared.mixed
-    if steady is not None and resolved and system.steady_covariance and system.steady_noise and not system.samples:
-        return _factors_alone(prepared, steady)
-    count, seen, m = len(schedule), schedule.seen, system.m
+    resolved, count, seen, m = system.resolved, len(schedule), schedule.seen, system.m
     starts, lengths, stops = schedule.starts[:, None], prepared.lengths[:, None], schedule.stops[:, None]
     if prepared.timed:
         t = np.minimum(starts + lengths * GAUSS_NODES, np.nextafter(stops, starts))
@@ -370,7 +378,11 @@ def coefficients_of(prepared: Prepared, steady: CoefficientsInTime | None = None
         factors = np.broadcast_to(np.eye(size + 1), (count, size + 1, size + 1))
     else:
         assert system.separated is not None
-        factors = everywhere(system.separated[0], False)
+        if resolved and prepared.timed:
+            times = np.array(schedule.starts), np.array(schedule.stops), prepared.lengths
+            factors = polynomials_at_nodes(prepared.polynomials, *times)[:, : t.shape[1]]
+        else:
+            factors = everywhere(system.separated[0], False)
     if steady is not None and system.steady_covariance:
         covariances = steady.covariances
     else:
@@ -394,16 +406,6 @@ def coefficients_of(prepared: Prepared, steady: CoefficientsInTime | None = None
             parts = np.maximum(parts, parts_needed(precision(noise[:, probes])[0], precisions))
     drifts, outputs = (np.array(factors[:, part], order="C") for part in (own, ends))
     return CoefficientsInTime(drifts, outputs, covariances, precisions, constants, parts)
-
-
-def _factors_alone(prepared: Prepared, steady: CoefficientsInTime) -> CoefficientsInTime:
-    """Return the coefficients of one interval in which only the factors of f and h, which the nodes resolve, vary in time."""
-    assert prepared.system.separated is not None
-    start, stop = prepared.schedule.starts[0], prepared.schedule.stops[0]
-    t = np.minimum(start + prepared.lengths[0] * GAUSS_NODES[None], np.nextafter(stop, start))
-    factors = prepared.system.separated[0](_X, t, prepared.theta)
-    parts = np.array([int(np.isfinite(factors).all())])
-    return steady._replace(drifts=factors, outputs=factors[:, : steady.outputs.shape[1]], parts=parts)
 
 
 def _mixed_terms(prepared: Prepared, t: np.ndarray) -> np.ndarray:
@@ -455,9 +457,8 @@ def steps_of(prepared: Prepared) -> Steps:
         if len(here):
             parameters[here] = packed(kernels.transitions, kernels.place[here])
         precisions = np.where((kinds == KERNEL)[:, None, None, None], 0.0, precisions)
-    lengths = np.ascontiguousarray(prepared.lengths)
     shares = np.ones(len(kinds)) if prepared.shares is None else prepared.shares
-    return Steps(kinds, lengths, shares, precisions, c.constants, parameters, c.drifts, c.outputs, c.covariances)
+    return Steps(kinds, np.ascontiguousarray(prepared.lengths), shares, precisions, c.constants, parameters, *c[:3])
 
 
 def parts_of(prepared: Prepared) -> Parts | None:

@@ -13,7 +13,6 @@ class Report:
     def __init__(self) -> None:
         self.aliasing = self.edge = self.time = self.noise = self.depth = self.growth = self.negative = self.lawless = 0.0
         self.positive = True  # small values are accurate
-        self.decomposed = True  # the operator has a decomposition on the grid that serves every interval
 
     def density(self, check: lw.GridCheck) -> None:
         """Note the figures of a density."""

@@ -18,19 +18,18 @@ from zakai.methods._protocol import Infos, Tangents
 from zakai.methods.line import filter as line_filter
 from zakai.methods.line.backward_loop import log_likelihoods
 from zakai.methods.line.coefficients import spectral
-from zakai.methods.line.loop import DIVIDED, START, Piece, grid_of, infos_of
+from zakai.methods.line.loop import Piece, grid_of, infos_of
 from zakai.methods.line.parts import segment_of_parts
-from zakai.methods.line.prepared import Parts, Prepared, State
-from zakai.methods.line.transition import ModalTransition
+from zakai.methods.line.prepared import CoefficientsInTime, Parts, Prepared, State
 from zakai.methods.line.update import factor_of
 from zakai.numerics.arrays import Array
 from zakai.numerics.complex_step import STEP
 from zakai.numerics.line import window as lw
 from zakai.numerics.line.splitting import Interval, TangentCoefficients, through
-from zakai.numerics.line.steps import SPLIT
+from zakai.numerics.line.steps import NEEDED, PAIRS, SPLIT, START, SUBSTEPS
 from zakai.numerics.line.tangents import Varied, extended, resampled_tangents
 
-IN_TIME = "drifts", "outputs", "covariances", "precisions"
+IN_TIME = CoefficientsInTime._fields[:4]  # what varies with the parameters
 
 
 def tangents(
@@ -72,12 +71,10 @@ class _Walk:
         def noted(k: int, before: State, result: line_filter.FilteredSteps) -> None:
             values = observed[k - rows.start :]
             if isinstance(result, line_filter.SingleStep):
-                if result.parts is not None:
-                    self.in_parts(result.parts, slice(0, 1), before, values[:1])
-                elif result.transition is not None:
-                    self._passed(prepared, k, before, result, result.transition, values[0])
-                else:
+                if result.parts is None:
                     self._singly(k, before, result.state, values[0])
+                else:
+                    self.in_parts(result.parts, slice(0, 1), before, values[:1])
                 return
             for piece in result:
                 place = piece.first - k
@@ -117,8 +114,9 @@ class _Walk:
             k, window, after = piece.first + i, states[i].window, piece.densities[i]
             centre, spacing, size, margin = coarse[i].tolist()
             wide = window._replace(centre=centre, spacing=spacing, size=int(size))
-            varied, margins = self._varied(prepared, wide), (int(margin), int(margin))
-            predicted, self.tangents = varied.through(states[i].values, self.tangents, prepared.lengths[k], window, wide, margins)
+            predicted, self.tangents = self._varied(prepared, wide).through(
+                states[i].values, self.tangents, prepared.lengths[k], window, wide, int(margin)
+            )
             new = window._replace(centre=float(piece.centres[i]), spacing=float(piece.spacings[i]), size=len(after))
             self._regrid(predicted, wide, new)
             seen, logs = prepared.schedule.seen[k], np.zeros((len(self.shifted), len(after)), complex)
@@ -168,26 +166,12 @@ class _Walk:
 
     def _divided(self, prepared: Prepared, piece: Piece, i: int, observed: Array) -> Interval | None:
         """Return what the filter did in a step that was split, None for another one."""
-        k, (pairs, substeps, needed) = piece.first + i, piece.reports[i, DIVIDED]
+        k, (pairs, substeps, needed) = piece.first + i, piece.reports[i, [PAIRS, SUBSTEPS, NEEDED]]
         if substeps == 0.0:
             return None
-        length, inside, closed = float(prepared.lengths[k]), bool(prepared.kinds[k] == SPLIT), piece.before.closed
-        return Interval(length, piece.before.spacing, closed, observed, inside, int(pairs), int(substeps), bool(needed > 0.0))
-
-    def _passed(
-        self, prepared: Prepared, k: int, before: State, step: line_filter.SingleStep, transition: ModalTransition,
-        observed: Array,
-    ) -> None:  # fmt: skip
-        """Take a single step whose transition is by modes."""
-        self._regrid(before.values, before.window, transition.window)
-        density, propagated = self._varied(prepared, transition.after).through(
-            transition.values, self.tangents, transition.length, transition.window, transition.after, transition.margins
-        )
-        self.tangents = propagated / np.exp(transition.log_mass)
-        self._regrid(density, transition.after, step.window)
-        logs = self._logs(partial(_logs_of, k=k, observed=observed, points=step.window.points), prepared)
-        self._multiply(step.values, logs, step.info.log_likelihood_increment - transition.log_mass)
-        self._regrid(step.values, step.window, step.state.window)
+        length, inside, depth = float(prepared.lengths[k]), bool(prepared.kinds[k] == SPLIT), 8.0 - float(np.log(prepared.cut))
+        narrow, (spacing, closed) = bool(needed > 0.0), (piece.before.spacing, piece.before.closed)
+        return Interval(length, spacing, closed, observed, inside, int(pairs), int(substeps), narrow, depth)
 
     def _logs(self, function: Callable[[Prepared], Array], prepared: Prepared) -> Array:
         """Return the logarithms (p, ...) of likelihoods, with imaginary parts where a likelihood depends on the parameter."""

@@ -23,12 +23,9 @@ from zakai.methods.line.coefficients import (
     coefficients,
     offset_of,
     on_grid_for_drift,
-    potential_of,
-    precision_of,
     resolved_parts,
     spectral,
     speed_of,
-    tables,
 )
 from zakai.methods.line.modal import coarsened
 from zakai.methods.line.prepared import Prepared, TimeInterval
@@ -37,12 +34,14 @@ from zakai.methods.line.update import refitted
 from zakai.numerics.arrays import Array, Number
 from zakai.numerics.line import window as lw
 from zakai.numerics.line.averages import GAUSS_NODES, GAUSS_WEIGHTS
+from zakai.numerics.line.grid_choice import DECAYED
 from zakai.numerics.line.operator import FourierOperator, Generator, exponential_of
 from zakai.numerics.line.product import finer
 from zakai.numerics.line.resolution import (
     GROSS,
     LOST_ALIASING,
     LOST_MASS,
+    MAGNUS,
     NOISE,
     SPECTRUM_FACTOR,
     TRANSITION_SHARE,
@@ -53,8 +52,6 @@ from zakai.numerics.line.resolution import (
 )
 
 PARTS_OF_SUBSTEP = (1, 4, 16)  # of a substep with six nodes each, where the grid moves
-SMOOTHED = 100.0  # decay of the shortest wave of a large grid, as a logarithm, after which a coarser grid serves
-MAGNUS = 0.02  # of the tolerance that one substep of Magnus' series may leave
 
 
 class Substep(NamedTuple):
@@ -97,14 +94,12 @@ class Exponents(NamedTuple):
 
 def trial_substep(prepared: Prepared, values: Array, window: lw.Window, substep: Substep, adjoint: bool = False) -> Trial:
     """Return the density after a substep; the `adjoint` of the transition takes a message from its end to its start."""
-    inside, moving = substep.inside, bool(substep.speed)
-    if prepared.system.varying or moving:
-        return magnus(prepared, values, window, substep, _at_points(prepared, values, window, substep), adjoint, moving)
-    modes = None if adjoint or inside.any() else by_modes(prepared, values, window, substep.length)
-    if modes is not None:
-        return Trial(modes[0], 0.0, modes[1], False)
-    exponents = exponents_of(prepared, values, window, substep)
-    return _acted(prepared, values, window, substep, exponents, adjoint, not inside.any())
+    moving = bool(substep.speed)
+    if not (prepared.system.varying or moving or adjoint or substep.inside.any()):
+        modes = by_modes(prepared, values, window, substep.length)
+        if modes is not None:
+            return Trial(modes[0], 0.0, modes[1], False)
+    return magnus(prepared, values, window, substep, _at_points(prepared, values, window, substep), adjoint, moving)
 
 
 def parts_of_split(prepared: Prepared, first: float, last: float, error: float) -> list[tuple[float, float]]:
@@ -114,22 +109,6 @@ def parts_of_split(prepared: Prepared, first: float, last: float, error: float) 
     return list(zip([first, *cuts], [*cuts, last], strict=True))
 
 
-def exponents_of(prepared: Prepared, values: Array, window: lw.Window, substep: Substep) -> Exponents:
-    """Return the generators of a substep: one where no coefficient depends on t, else those of Magnus' integrator."""
-    if prepared.system.varying or substep.speed:
-        averages = _averaged(substep, _at_points(prepared, values, window, substep))
-        return _of_magnus(prepared, values, averages, bool(substep.speed))
-    known, length = tables(prepared, window), substep.length
-    if not substep.inside.any():
-        return Exponents([Generator(length * known.covariance, length * known.drift, np.zeros(window.size))], 0.0, 0.0, 0.0)
-    precision = precision_of(prepared, substep.start, substep.inside)
-    potential, constant = potential_of(known.observation, precision, substep.rates, values)
-    potential = length * potential
-    offset, lift = offset_of(potential, values)
-    generator = Generator(length * known.covariance, length * known.drift, potential - offset)
-    return Exponents([generator], offset, length * constant, lift)
-
-
 def _acted(
     prepared: Prepared, values: Array, window: lw.Window, substep: Substep, exponents: Exponents, adjoint: bool, keeps: bool
 ) -> Trial:
@@ -137,7 +116,8 @@ def _acted(
     if exponents.lift > GROWTH:
         return Trial(values, 0.0, 0.0, True)
     matrices, result, error = [window.generator(*one) for one in exponents.generators], values, 0.0
-    if any(isinstance(one, FourierOperator) and one.decay > SMOOTHED for one in matrices):
+    # A coarser grid serves where no short wave is left of a large one.
+    if any(isinstance(one, FourierOperator) and one.decay > DECAYED for one in matrices):
         return Trial(values, 0.0, 0.0, True)
     if adjoint:
         matrices = [one.T for one in matrices[::-1]]
@@ -216,12 +196,14 @@ def magnus(
     """
     for parts in PARTS_OF_SUBSTEP if moving else PARTS_OF_SUBSTEP[:1]:
         substep = substep._replace(parts=parts)
-        averages, error, length = _averaged(substep, at, not prepared.system.varying and not moving), 0.0, substep.length
+        steady = not prepared.system.varying and not moving
+        averages, error, length = _averaged(substep, at, steady), 0.0, substep.length
         if moving:
             known = averages.coefficients
             error = _unresolved(window, values, length * known.drift, length * known.potential)
         if error <= MAGNUS * prepared.tolerance:
-            return _acted(prepared, values, window, substep, _of_magnus(prepared, values, averages, moving), adjoint, False)
+            exponents, keeps = _of_magnus(prepared, values, averages, moving), steady and not substep.inside.any()
+            return _acted(prepared, values, window, substep, exponents, adjoint, keeps)
     return Trial(values, 0.0, error, True)
 
 
@@ -257,28 +239,13 @@ MOST_SUBSTEPS = 4000
 SUBSTEPS_OF_LARGE_GRID = 24  # substeps of an interval, after which no large grid is used
 
 
-class ModalTransition(NamedTuple):
-    """A transition by modes: the density and the grid before it, its length, the logarithm of its mass, and the grid after it.
-
-    The latter is that of the modes, of which at the `margins`, in points, there is no density.
-    """
-
-    values: Array
-    window: lw.Window
-    length: float
-    log_mass: Number
-    after: lw.Window
-    margins: tuple[int, int] = 0, 0
-
-
 class Prediction(NamedTuple):
-    """The density after an interval, its grid, the logarithm of its mass, its grid check, and its transition if that is modal."""
+    """The density after an interval, its grid, the logarithm of its mass, and its grid check."""
 
     values: Array
     window: lw.Window
     gained: Number
     check: lw.GridCheck | None
-    transition: ModalTransition | None = None
 
 
 def by_decomposition(prepared: Prepared, values: Array, window: lw.Window, length: float, report: Report) -> Prediction | None:
@@ -286,8 +253,7 @@ def by_decomposition(prepared: Prepared, values: Array, window: lw.Window, lengt
     negligible, rough = prepared.negligible, noise_bound(prepared.tolerance)
     carried = coarsened(prepared, values, window, length)
     if carried is not None:
-        transition = ModalTransition(values, window, length, 0.0, carried.window, carried.margins)
-        return _normalised(carried.values, carried.window, carried.error, report, negligible, transition)
+        return _normalised(*carried, report, negligible)
     known, begin = lw.grid_check(values, window.closed, negligible).aliasing, window
     while window.size <= lw.LARGEST:
         result = by_modes(prepared, values, window, length)
@@ -307,8 +273,7 @@ def by_decomposition(prepared: Prepared, values: Array, window: lw.Window, lengt
             report.time += missing
             if window != begin:  # noise that the new grid has brought, which the transition smooths before it is seen
                 report.aliasing = max(report.aliasing, lw.grid_check(values, window.closed, negligible).aliasing - known)
-            transition = ModalTransition(values, window, length, 0.0, window)
-            return _normalised(result[0], window, result[1], report, negligible, transition)
+            return _normalised(result[0], window, result[1], report, negligible)
         new = lw.enlarged(window, left, right)
         if new == window:
             return None
@@ -358,7 +323,6 @@ def _by_substeps(
         part = interval.part(first, last)
         fitted = _on_fitting_grid(prepared, values, window, part, moving, most, divisible)
         trial, values, window, check = fitted.trial, fitted.values, fitted.window, fitted.check
-        report.decomposed = trial.substep is None
         if fitted.split:
             if trial.split and trial.error > 0:
                 stack += parts_of_split(prepared, first, last, trial.error)[::-1]
@@ -446,12 +410,10 @@ def _on_fitting_grid(
     return _Fitted(trial, values, window, check, False, missing, brought)
 
 
-def _normalised(
-    result: Array, window: lw.Window, error: float, report: Report, negligible: float, transition: ModalTransition
-) -> Prediction:
+def _normalised(result: Array, window: lw.Window, error: float, report: Report, negligible: float) -> Prediction:
     check = lw.grid_check(result, window.closed, negligible)
     report.density(check)
-    report.time, report.decomposed = report.time + error, True
+    report.time += error
     result = np.where(result.real > 0, result, 0.0)
     mass = np.sum(result)
-    return Prediction(result / mass, window, np.log(mass), check, transition._replace(log_mass=np.log(mass)))
+    return Prediction(result / mass, window, np.log(mass), check)

@@ -84,7 +84,7 @@ def refitted(
 
 
 def on_fitting_grid(
-    prepared: Prepared, values: Array, window: lw.Window, check: lw.GridCheck, generous: int, margin: float = 0.12
+    prepared: Prepared, values: Array, window: lw.Window, check: lw.GridCheck, generous: int
 ) -> tuple[Array, lw.Window, float]:
     """Return a density on the grid for the next interval, this grid, and the spectrum that it does not resolve.
 
@@ -93,7 +93,7 @@ def on_fitting_grid(
     """
     most, large = prepared.largest, prepared.largest_for(check, window.size)
     while True:
-        new = lw.fitted(check, window, most, generous, margin)
+        new = lw.fitted(check, window, most, generous)
         if new == window:
             return values, window, check.aliasing
         new_values = resampled(prepared, values, window, new)

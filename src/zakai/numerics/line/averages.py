@@ -11,16 +11,35 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
+from numba import complex128, float64
 
 from zakai.numerics.arrays import Array
-from zakai.numerics.compiled import helper
-from zakai.numerics.line.density import highest_of
+from zakai.numerics.compiled import helper, kernel
+from zakai.numerics.line.density import highest_of, support
 from zakai.numerics.line.steps import CELL, DRIFT, IMPOSSIBLE, SLOPE, Coefficients, add, exponent_added, observation_of
 
 NODES = 6
 _nodes, _weights = np.polynomial.legendre.leggauss(NODES)
 GAUSS_NODES: Array = (_nodes + 1.0) / 2.0
 GAUSS_WEIGHTS: Array = _weights / 2.0
+
+_V, _M = float64[::1], float64[:, ::1]
+
+
+@kernel(float64[:, :, ::1](_M, _V, _V, _V), complex128[:, :, ::1](complex128[:, ::1], _V, _V, _V))
+def polynomials_at_nodes(coefficients: Array, starts: Array, stops: Array, lengths: Array) -> Array:
+    """Return polynomials of time (D, R), the highest power first, at the nodes of intervals and at their ends (K, Q + 1, R)."""
+    result = np.empty((starts.size, NODES + 1, coefficients.shape[1]), coefficients.dtype)
+    for k in range(starts.size):
+        for q in range(NODES + 1):
+            t = stops[k] if q == NODES else min(starts[k] + lengths[k] * GAUSS_NODES[q], stops[k])
+            for r in range(coefficients.shape[1]):
+                value = coefficients[0, r]
+                for row in range(1, coefficients.shape[0]):
+                    value = value * t + coefficients[row, r]
+                result[k, q, r] = value
+    return result
+
 
 PROBES = 129  # times of an interval at which coefficients are compared with their interpolants
 _PROBES_OF_PART = 21
@@ -72,7 +91,7 @@ class Panels(NamedTuple):
     error: float
 
 
-def panels(coefficients: Callable[[Array], Array], start: float, stop: float, tolerance: float = 1e-8) -> Panels:
+def panels(coefficients: Callable[[Array], Array], start: float, stop: float, tolerance: float = RESOLVED_IN_TIME) -> Panels:
     """Return parts of [start, stop] in each of which the polynomial through six Gauss nodes agrees with the coefficients.
 
     Args:
@@ -104,7 +123,7 @@ def panels(coefficients: Callable[[Array], Array], start: float, stop: float, to
 
 _EXACT = 1e-14  # second Legendre coefficient in time, relative to the mean, that is rounding
 MOST_MAGNUS = 32  # equal parts of an interval with two averages each
-MEAN, EARLY, LATE, DIFFERENCE, SECOND = 0, 1, 2, 3, 4  # weights of a part
+MEAN, EARLY, LATE, DIFFERENCE, SECOND = range(5)  # weights of a part
 
 
 def _averages() -> Array:
@@ -181,11 +200,13 @@ def averaged(
 
 
 @helper
-def _generated(u: Array, parts: Array, spread: float, spacing: float, weight: float, closed: bool, to: Array) -> None:
+def _generated(
+    u: Array, drift: Array, potential: Array, spread: float, spacing: float, weight: float, closed: bool, to: Array
+) -> None:
     """Add the integral of the equation's right-hand side with a weight, by differences of fourth order."""
     size, around, flow = u.size, np.zeros(u.size + 4), np.zeros(u.size + 4)
     for j in range(size):
-        around[j + 2], flow[j + 2] = u[j], parts[0, j] * u[j]
+        around[j + 2], flow[j + 2] = u[j], drift[j] * u[j]
     skipped = 0 if closed else 2  # points at the ends of a line
     if closed:
         for j in range(2):
@@ -196,7 +217,7 @@ def _generated(u: Array, parts: Array, spread: float, spacing: float, weight: fl
     first, second, fourth, fifth = flow[:size], flow[1 : size + 1], flow[3 : size + 3], flow[4:]
     for j in range(skipped, size - skipped):
         curved = 16.0 * (b[j] + d[j]) - a[j] - e[j] - 30.0 * c[j]
-        to[j] += two * curved - one * (8.0 * (fourth[j] - second[j]) - fifth[j] + first[j]) + weight * parts[1, j] * c[j]
+        to[j] += two * curved - one * (8.0 * (fourth[j] - second[j]) - fifth[j] + first[j]) + weight * potential[j] * c[j]
 
 
 # Which operator (B, D, E) acts on which density, with which weight, and to which density it is added.  From the density 0 they
@@ -210,9 +231,12 @@ _PRODUCTS = np.array(
 
 
 @helper
-def operators(table: Array, c: Coefficients, averages: Array, at: int, to: Array, spreads: Array) -> None:
-    """Write f and the potential (3, 2, N), and int G dt (3,), of B, D and E in a part of an interval, see `averaging`."""
-    tau = c.length
+def operators(table: Array, c: Coefficients, averages: Array, at: int, to: Array, spreads: Array) -> bool:
+    """Write f and the potential (3, 2, N), and int G dt (3,), of B, D and E in a part of an interval, see `averaging`.
+
+    Returns whether E is rounding: the coefficients are linear in time.
+    """
+    tau, linear = c.length, not c.inside or c.outputs.shape[0] == 1
     to[:] = 0.0
     for i in range(3):
         weights, whole = averages[MEAN if i == 0 else (DIFFERENCE if i == 1 else SECOND)], 0.0
@@ -222,8 +246,11 @@ def operators(table: Array, c: Coefficients, averages: Array, at: int, to: Array
             whole += weights[q]
         for r in range(table.shape[0]):
             weight = 0.0
+            largest = 0.0
             for q in range(weights.size):
                 weight += tau * weights[q] * c.drifts[q, r]
+                largest = max(largest, abs(c.drifts[q, r]))
+            linear &= i < 2 or abs(weight) <= _EXACT * tau * largest
             if weight != 0.0:
                 add(to[i, 0], weight, table[r, DRIFT])
         if c.inside and (i == 0 or c.outputs.shape[0] > 1):
@@ -231,28 +258,30 @@ def operators(table: Array, c: Coefficients, averages: Array, at: int, to: Array
                 w = whole if c.outputs.shape[0] == 1 else weights[q]
                 h, centre = observation_of(table, c.outputs[q], at)
                 exponent_added(h, centre, c.precisions[q], c.observed, w, w * tau, to[i, 1])
+    return linear and abs(spreads[2]) <= _EXACT * spreads[0]
 
 
 @helper
-def averaging(values: Array, parts: Array, spreads: Array, spacing: float, closed: bool) -> tuple[float, float]:
+def averaging(
+    values: Array, parts: Array, spreads: Array, linear: bool, spacing: float, closed: bool
+) -> tuple[float, float]:
     """Return estimates of the errors of the mean and of two averages in a part of an interval.
 
     With the integral B of the operator, D the difference of the averages and E the second Legendre coefficient they are
-    [B, D] / 4 + [B, [B, E]] / 10, and of fifth order 5 |[B, D] / 4|^(5/3) + [B, [B, E]] / 10.  Of coefficients that are linear
-    in time E is rounding, and is left out.
+    [B, D] / 4 + [B, [B, E]] / 10, and of fifth order 5 |[B, D] / 4|^(5/3) + [B, [B, E]] / 10.  Of coefficients that are `linear`
+    in time E is left out.
     """
-    size = values.size
+    begin, end = 0, values.size
+    if not closed:  # where the density counts, and the points of three differences beyond
+        begin, end = support(values, 1e-12)
+        begin, end = max(begin - 6, 0), min(end + 7, values.size)
+    values, size = values[begin:end], end - begin
     result = np.zeros((8, size))
     add(result[0], 1.0, values)
-    linear = spreads[2] <= _EXACT * spreads[0]
-    for row in range(2):
-        whole, second = 0.0, 0.0
-        for j in range(size):
-            whole, second = max(whole, abs(parts[0, row, j])), max(second, abs(parts[2, row, j]))
-        linear &= second <= _EXACT * whole
     for i in range(4 if linear else len(_PRODUCTS)):
         operator, of, weight, to = _PRODUCTS[i]
-        _generated(result[of], parts[operator], spreads[operator], spacing, float(weight), closed, result[to])
+        drift, potential = parts[operator, 0, begin:end], parts[operator, 1, begin:end]
+        _generated(result[of], drift, potential, spreads[operator], spacing, float(weight), closed, result[to])
     one, two, mass, limit = 0.0, 0.0, 0.0, 1e-12 * values[highest_of(values)]
     for j in range(size):
         mass += values[j]

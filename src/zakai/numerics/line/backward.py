@@ -20,8 +20,8 @@ from zakai.numerics.compiled import helper, kernel
 from zakai.numerics.line.averages import AVERAGES, EARLY, LATE, MEAN, MOST_MAGNUS, WHOLE, averaged, averaging, operators
 from zakai.numerics.line.density import circular_moments, highest_of, moments, shifted, spectrum, support, waves
 from zakai.numerics.line.modes import decayed, propagate
-from zakai.numerics.line.resolution import ROUNDING, SMOOTHER_SHARE
-from zakai.numerics.line.splitting import STEEPEST, Filtering, differences, residual, split
+from zakai.numerics.line.resolution import RESOLVED, ROUNDING, SMOOTHER_SHARE
+from zakai.numerics.line.splitting import MOST_SUBSTEPS, STEEPEST, Filtering, differences, residual, split
 from zakai.numerics.line.steps import (
     CONSTANTS_TYPE,
     GRID_TYPE,
@@ -41,7 +41,6 @@ UNRESOLVED = 1e-5  # spectrum of a smoothed density at the highest frequencies u
 FEWEST = 12  # points of a message
 SMALLEST = 1e-15  # of the maximum: smaller values of psi count as this
 SURE = 100.0  # errors of psi from which its small values count
-LEAST = 1e-11  # of the maximum: the same
 LOG_MASS, MEAN_AT, VARIANCE, ALIASING, EDGE, ERROR = range(6)  # what is reported of a smoothed density
 
 
@@ -241,7 +240,7 @@ def _decomposed(
         at = place + stride * highest_of(products[i])
         error = made + error * error_share(before, between, spread(b, first, last))
         row[ERROR] = error
-        scale, reliable = np.log(highest / total) - reference, max(SURE * level / highest, LEAST)
+        scale, reliable = np.log(highest / total) - reference, max(SURE * level / highest, RESOLVED)
         for j in range(longer):
             psi[j] = propagated[j] / highest
     return lengths.size, error, scale, reliable
@@ -278,7 +277,6 @@ def by_modes(
     return BackwardSteps(result, completed, products[count - completed :], out[count - completed :])
 
 
-MOST_SUBSTEPS = 512
 EXCURSION = 3.9  # standard deviations of the noise that a path between two points goes beyond them, but for exp(-30)
 
 
@@ -316,8 +314,8 @@ def _split(
     made, constant, magnus = 0.0, 0.0, 0
     if averages.shape[0] > 1:
         both, spreads = np.empty((3, 2, size)), np.empty(3)
-        operators(table, c, averages[0], at, both, spreads)
-        made, pair = averaging(product, both, spreads, spacing, closed)
+        linear = operators(table, c, averages[0], at, both, spreads)
+        made, pair = averaging(product, both, spreads, linear, spacing, closed)
         if not (made <= most):
             magnus = int(min(max(np.ceil(1.1 * (pair / most) ** 0.25), 1.0), 1e6))
             made = pair / float(magnus) ** 4

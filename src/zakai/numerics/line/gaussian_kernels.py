@@ -23,7 +23,7 @@ from zakai.numerics.arrays import Array, Number
 from zakai.numerics.compiled import helper, kernel
 from zakai.numerics.exponentials import exponentiate
 from zakai.numerics.line.density import highest_of
-from zakai.numerics.line.steps import Transition, failed
+from zakai.numerics.line.steps import LEAST, Transition, failed
 from zakai.numerics.transition import Transition as LinearTransition
 
 
@@ -63,7 +63,6 @@ def around(channel: Channel, origin: float) -> Channel:
 
 WIDE = 1.96  # variance of a kernel, in squares of the spacing, from which its samples are a filter
 BAND = 0.625  # part of the frequencies of a grid for which the filters of narrow kernels are exact
-_LEAST = 1e-240  # factor of a density whose products with all values that count are normal numbers
 _NODES = 128  # of the periodic transfer function of a narrow kernel
 _TAPS = 50
 _FREQUENCIES = 2.0 * np.pi / _NODES * np.arange(_NODES // 2 + 1)
@@ -263,7 +262,7 @@ def convolved(
         _quadratic(late, shift / variance * spacing, 0.5 * (a - 1.0) / variance * spacing**2)
         for j in range(size):
             early[j], late[j] = early[j] / gauge[j], late[j] * gauge[j]
-            if not (_LEAST < early[j] < 1.0 / _LEAST and _LEAST < late[j] < 1.0 / _LEAST):  # products may underflow
+            if not (LEAST < early[j] < 1.0 / LEAST and LEAST < late[j] < 1.0 / LEAST):  # products may underflow
                 return failed(variance, 0.0)
         for j in range(size):
             density[j] *= early[j]

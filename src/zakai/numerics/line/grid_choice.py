@@ -18,9 +18,7 @@ from zakai.numerics.line.window import ALIGNMENT, SIZES, SMALL, STENCIL_WEIGHTS
 
 PER = 8  # points of rows in a spacing of the grid
 _STENCIL = len(STENCIL_WEIGHTS)
-DEPTH = 36.0  # logarithm below the largest value from which cells are left out
-_TAIL = 32.0  # logarithm below the largest value at the ends of the range
-LEVELS = 80
+DEPTH = 34.0  # logarithm below the largest value from which cells are left out
 MOST_CELLS = 4096
 
 
@@ -111,7 +109,7 @@ def placed(logs: Array, first: int, last: int, likelihood: Likelihood) -> tuple[
     weights, h, count, done = np.empty(_STENCIL), np.empty(likelihood.rows.shape[0]), last - first, 0
     for j in range(count):
         left[j], width[j] = first + j, 1.0
-    for _ in range(LEVELS):
+    while done < count:
         for c in range(done, count):
             highest, top, bottom = _surveyed(left[c], width[c], logs, likelihood, weights, h)
             level[c, 0], level[c, 1], level[c, 2], best = highest, top, bottom, max(best, highest)
@@ -135,11 +133,9 @@ def placed(logs: Array, first: int, last: int, likelihood: Likelihood) -> tuple[
             for part in range(2):
                 left[count], width[count] = left[c] + 0.5 * part * width[c], 0.5 * width[c]
                 count += 1
-        if count == done:
-            break
     low, high, finest = np.inf, -np.inf, np.inf
     for c in range(done):
-        if level[c, 0] >= best - _TAIL:
+        if level[c, 0] >= best - DEPTH:
             low, high, finest = min(low, left[c]), max(high, left[c] + width[c]), min(finest, width[c])
     return low, high, finest
 
@@ -241,11 +237,11 @@ def sampled(
 
 
 PROFILE = 4096  # offsets at which f and G are known without a grid
-REACH = 7.6  # standard deviations of the noise by which the support grows
+REACH = 7.6  # standard deviations of the noise by which the support grows, and by which waves of the interpolation spread
+WIDENING = REACH
 FAR = 3.0  # ranges of a density that it moves in an interval, above which grids move with it
-SPACING = 0.34  # spacing in standard deviations of the noise, at most: the shortest wave decays by exp(-42)
-WIDENING = 7.2  # of them beyond the support: the waves that R' leaves everywhere end there, and spread from the ends
-_NARROW = 7.0  # support of a density in standard deviations of the noise
+DECAYED = 42.0  # -log of the factor of a mode that is negligible
+SPACING = np.pi / np.sqrt(2.0 * DECAYED)  # largest spacing in standard deviations of the noise: the shortest wave is negligible
 _APART = 32  # the centres of coarse grids are multiples of so many spacings
 _SIZES = np.array(SIZES)
 
@@ -274,7 +270,7 @@ def outlook(low: float, high: float, tau: float, unit: float, profile: Array) ->
             spacing is infinite where the interval makes the support far wider, else zero.
     """
     if profile.shape[1] == 1:
-        return Outlook(np.inf if high - low < _NARROW * np.sqrt(profile[2, 0] * tau) else 0.0, low, high, 0.0)
+        return Outlook(np.inf if high - low < REACH * np.sqrt(profile[2, 0] * tau) else 0.0, low, high, 0.0)
     middle, per, last = profile.shape[1] // 2, PER / unit, profile.shape[1] - 1.0
     first, stop = int(min(max(np.floor(low * per) + middle, 0.0), last)), int(min(max(np.ceil(high * per) + middle, 0.0), last))
     least, most = profile[2, first], profile[2, first]
@@ -290,7 +286,7 @@ def outlook(low: float, high: float, tau: float, unit: float, profile: Array) ->
     spacing = unit * 2.0 ** (0.5 * np.floor(2.0 * np.log2(spacing / unit) + 1e-9))
     half, centre = 0.5 * (high - low) * np.exp(-slow) + REACH * wide * np.sqrt(relative(2.0 * slow)), 0.5 * (low + high)
     spacing = np.nan if abs(shift) > 2.0 * FAR * half else spacing
-    return Outlook(spacing, centre - half + min(shift, 0.0), centre + half + max(shift, 0.0), WIDENING * wide)
+    return Outlook(spacing, centre - half + min(shift, 0.0), centre + half + max(shift, 0.0), REACH * wide)
 
 
 @helper

@@ -25,7 +25,7 @@ from zakai.numerics.arrays import Array
 from zakai.numerics.compiled import helper, kernel
 from zakai.numerics.exponentials import exponentiate
 from zakai.numerics.line.density import highest_of
-from zakai.numerics.line.grid_choice import PER, Outlook, place_of, wanted, weigh, weighed
+from zakai.numerics.line.grid_choice import DECAYED, PER, Outlook, place_of, wanted, weigh, weighed
 from zakai.numerics.line.resolution import (
     EDGE_OF_ALIASING,
     LOST_MASS,
@@ -36,11 +36,10 @@ from zakai.numerics.line.resolution import (
     TRIALS,
 )
 from zakai.numerics.line.steps import FAILED, GRID, OK, RANGE
-from zakai.numerics.line.window import CUT, LARGEST
+from zakai.numerics.line.window import CUT, LARGEST, Window
 
 _V = float64[::1]
 
-_NEGLIGIBLE = 42.0  # -log of the factor of a mode that is negligible
 _SPREAD = 0.01  # of the value at an abrupt end that the interpolant spreads to the middle of the grid
 FALL = 4.2  # half of the range of erfc(y) / 2 from one to zero
 
@@ -49,7 +48,7 @@ FALL = 4.2  # half of the range of erfc(y) / 2 from one to zero
 def decayed(rates: Array, time: float) -> Array:
     """Return exp(-time rates) of the modes that are not negligible; the rates increase."""
     count = 1
-    while count < rates.size and time * (rates[count] - rates[0]) < _NEGLIGIBLE:
+    while count < rates.size and time * (rates[count] - rates[0]) < DECAYED:
         count += 1
     decay = np.empty(count)
     for n in range(count):
@@ -90,8 +89,15 @@ def unresolved(values: Array, cosines: Array, sines: Array) -> float:
     return np.sqrt(result) / abs(mass)
 
 
-@helper
-def gathered(values: Array, at: Array, result: Array) -> None:
+def gathered(values: Array, offsets: Array, window: Window) -> Array:
+    """Return the values (J,) at offsets times the matrix of interpolation from a grid on the line to them (N,)."""
+    at, result = (offsets - window.centre) / window.spacing + window.size // 2, np.empty(window.size)
+    _gather(np.ascontiguousarray(values.real), at, result)
+    return result + 1j * gathered(values.imag, offsets, window) if np.iscomplexobj(values) else result
+
+
+@kernel(void(_V, _V, _V))
+def _gather(values: Array, at: Array, result: Array) -> None:
     """Write the values at indices of a grid times the matrix of interpolation from its points (N,)."""
     for j in range(result.size):
         result[j] = 0.0
@@ -161,7 +167,7 @@ def carried(
         for i in range(density.size):
             inner[i] = density[i] * logs[i] if density[i] > limit else 0.0
         unsure /= total
-        gathered(inner, at, coefficients)
+        _gather(inner, at, coefficients)
         for j in range(first):  # the waves that R' leaves everywhere; where they end abruptly, the derivatives spread that
             fall = 0.5 * erfc(FALL * (2.0 * (first - j) / first - 1.0))
             coefficients[j] *= fall

@@ -16,12 +16,12 @@ from numba import boolean, float64, int64, types
 
 from zakai.numerics.arrays import Array
 from zakai.numerics.compiled import helper, kernel
+from zakai.numerics.line import steps as ls
 from zakai.numerics.line.density import highest_of, moments, separated, spectrum, support
 from zakai.numerics.line.grid_choice import PER, Likelihood, Outlook, differences, log_likelihood, outlook, place_of, sampled
 from zakai.numerics.line.modes import KnownGrids, Start, predicted
 from zakai.numerics.line.product import WEAK_SHARE, weak_error
 from zakai.numerics.line.resolution import NOISE, RELIABLE, SPECTRUM_FACTOR, step_error
-from zakai.numerics.line.steps import AFTER, BROAD, FAILED, GRID, NARROW, OK, RANGE, SIZE, UNRESOLVED, product
 from zakai.numerics.line.window import CUT
 
 _V, _M, _T = float64[::1], float64[:, ::1], float64[:, :, ::1]
@@ -119,11 +119,11 @@ def advance(
         if not closed:
             needed = outlook(centre + spacing * (begins - half), centre + spacing * (ends - half), tau, unit, profile)
         if np.isnan(needed.spacing):
-            return i, FAILED
+            return i, ls.FAILED
         if stays and needed.spacing >= 1.41 * spacing:
-            return i, NARROW
+            return i, ls.NARROW
         if not alone and not needed.spacing >= 1.41 * spacing:
-            return i, BROAD
+            return i, ls.BROAD
         if not stays or i == 0:
             answer[0], answer[1], answer[2] = centre, spacing, density.size
             place = place_of(index, answer)
@@ -131,7 +131,7 @@ def advance(
             Start(density, centre, spacing, error), needed, (begins, ends), (stays, alone, closed), tau, grids, limits,
             (place, answer),
         )  # fmt: skip
-        if move.status != OK:
+        if move.status != ls.OK:
             return i, move.status
         place, coarse, propagated, size = move.place, move.spacing, move.values, move.values.size
         after, before = moments(propagated)[2] * coarse**2, moments(density)[2] * spacing**2
@@ -139,7 +139,7 @@ def advance(
         # The sample.
         if owner >= -1:
             if place != owner:
-                return i, GRID
+                return i, ls.GRID
             rows = special[i]
         else:
             m, length = observed.shape[1], PER * (size - 1) + 1
@@ -156,44 +156,45 @@ def advance(
                 propagated, move.ends, (move.begin, coarse, unit), likelihood, density, b
             )
             if not enough:
-                return i, SIZE
+                return i, ls.SIZE
             for j in range(n):
                 density[j] *= spacing / coarse
             deeper = np.log(propagated[highest_of(propagated)] * spacing / coarse) - np.log(density[highest_of(density)])
-        added, growth, below = product(density, b) if seen else (0.0, 0.0, 0.0)
+        added, growth, below = ls.product(density, b) if seen else (0.0, 0.0, 0.0)
         on_left, on_right, from_at, to_at, _, unsampled, _, highest, _ = spectrum(density, CUT, negligible, cosines, sines, stays)
         limit = SPECTRUM_FACTOR * negligible if seen else np.inf
         if weak:  # of a kink the spectrum falls slowly
             unsampled, limit = 0.5 * weak_error(density, rows[1]) if seen else 0.0, WEAK_SHARE * allowed
         if np.isnan(added):
-            return i, FAILED
+            return i, ls.FAILED
         if not (unsampled <= limit):
             answer[0], answer[1], answer[2] = spacing * (begins - half), spacing * (ends - half), 0.6 * spacing
             if weak or not (unsampled < np.inf):
-                return i, FAILED
-            return i, SIZE if not stays else (RANGE if closed else UNRESOLVED)
-        growth, below = min(growth * np.exp(min(deeper, 300.0)), 1e80), below + deeper
+                return i, ls.FAILED
+            return i, ls.SIZE if not stays else (ls.RANGE if closed else ls.UNRESOLVED)
+        growth, below = growth * np.exp(min(deeper, 300.0)), below + deeper
         aliasing, rounding = max(move.aliasing, unsampled), move.rounding + (move.unsure + more)
         edge = move.edge if closed else max(move.edge, on_left, on_right)
-        row[1], row[2] = moments(density)[1:]
+        row[ls.MEAN], row[ls.VARIANCE] = moments(density)[1:]
         # What the ends of the grid absorb is missing.
         made = step_error(aliasing, edge, move.negative, rounding + abs(move.mass - 1.0), floor * growth)
         if not ((closed or not seen or max(on_left, on_right) < 1e-10) and made <= allowed):
-            return i, FAILED
-        ratio = min(max(np.sqrt(before * row[2]) * spacing / after, 0.3), 1.0)
+            return i, ls.FAILED
+        ratio = min(max(np.sqrt(before * row[ls.VARIANCE]) * spacing / after, 0.3), 1.0)
         # No estimate is reliable far below the tolerance.
         error = max(made + error * (1.0 if separated(density) else ratio), RELIABLE * allowed)
-        row[0], row[3], row[4] = np.log(move.mass) + constants[k] + constant + added, aliasing, edge
-        row[5], row[6], row[7] = move.negative, rounding, below / max(np.log(allowed) - np.log(floor), 2.3)
-        row[8], row[9], row[10], row[11], row[12] = growth, made, error, min(LOG_NOISE + max(below - 1.0, 0.0), 0.0), 0.0
+        row[ls.GAINED], row[ls.ALIASING], row[ls.EDGE] = np.log(move.mass) + constants[k] + constant + added, aliasing, edge
+        row[ls.NEGATIVE], row[ls.TIME], row[ls.DEPTH] = move.negative, rounding, below / max(np.log(allowed) - np.log(floor), 2.3)
+        row[ls.GROWTH], row[ls.MADE], row[ls.ERROR] = growth, made, error
+        row[ls.LOG_FLOOR] = min(LOG_NOISE + max(below - 1.0, 0.0), 0.0)
         places[i, 0], places[i, 1], places[i, 2], places[i, 3] = centre, spacing, place, move.inset
         for j in range(n):
             densities[i, j] = density[j]
         if stays:
             first, last = support(density, CUT) if weak else (int(from_at), int(to_at))
             if not serves(size, first, last, 1.0 if weak else 0.92 * (size // 2) / (max(highest, 0.0) + 1.0), closed, generous):
-                return i + 1, AFTER
-    return observed.shape[0], OK
+                return i + 1, ls.AFTER
+    return observed.shape[0], ls.OK
 
 
 @helper

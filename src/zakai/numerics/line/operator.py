@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from itertools import count
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -193,7 +194,6 @@ class Spectral:
 
 
 FOURIER_PART = 6.0  # norm up to which one Taylor series is summed
-FOURIER_TERMS = 80
 
 
 @dataclass(frozen=True, eq=False)
@@ -251,10 +251,10 @@ class FourierExponential:
         parts = max(1, int(np.ceil(self.norm / FOURIER_PART)))
         for _ in range(parts):
             term, negligible = vector, 1e-17 * np.max(np.abs(vector.real))
-            for k in range(1, FOURIER_TERMS):
+            for k in count(1):
                 term = self.operator @ term / (parts * k)
                 vector = vector + term
-                if np.max(np.abs(term.real)) < negligible:
+                if not np.max(np.abs(term.real)) > negligible:
                     break
             vector = vector * np.exp(self.shift / parts)
         return vector, 1e-15 * (1.0 + self.norm)

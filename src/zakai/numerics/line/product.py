@@ -17,17 +17,15 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numba import float64, int64, types, void
+from numba import float64, int64, void
 
 from zakai.numerics.arrays import Array, Number
 from zakai.numerics.compiled import kernel
 from zakai.numerics.line import window as lw
 from zakai.numerics.line.density import moments, support
-from zakai.numerics.line.grid_choice import DEPTH, LEVELS, MOST_CELLS
+from zakai.numerics.line.grid_choice import DEPTH, MOST_CELLS
 from zakai.numerics.line.resolution import GROSS, RESOLVED
-from zakai.numerics.line.steps import exponent_added
-
-_NOTHING = 1e-290
+from zakai.numerics.line.steps import LEAST, exponent_added
 
 
 @dataclass(frozen=True)
@@ -104,7 +102,7 @@ def multiplied(values: Array, window: lw.Window, likelihood: Likelihood, rough: 
     for _ in range(12):
         new_values = lw.resampled(values, window, new)
         if not new_values.any():  # the observation contradicts all that is known, which the depth reports
-            new_values = np.full_like(new_values, _NOTHING)
+            new_values = np.full_like(new_values, LEAST)
         product = _product(values, window, new_values, new, likelihood)
         if not np.isfinite(product.log_mass.real):
             return product
@@ -156,42 +154,19 @@ def normalized(density: Array, logs: Array, weights: Array, largest: float) -> t
         The probabilities (N,), the logarithm of their sum before, how deep below `largest` the mass of the product is, and the
         growth of errors.
     """
-    if np.iscomplexobj(logs) or np.iscomplexobj(density):
-        logs, density = logs.astype(complex), density.astype(complex)
-    result: tuple[Array, Number, float, float] = _normalized(*map(np.ascontiguousarray, (density, logs, weights)), largest)
-    return result
-
-
-_R, _C = types.float64, types.complex128
-
-
-@kernel(
-    types.Tuple((_R[::1], _R, _R, _R))(_R[::1], _R[::1], _R[::1], _R),  # type: ignore[no-untyped-call]
-    types.Tuple((_C[::1], _C, _R, _R))(_C[::1], _C[::1], _R[::1], _R),  # type: ignore[no-untyped-call]
-)
-def _normalized(values: Array, logs: Array, weights: Array, largest: float) -> tuple[Array, Number, float, float]:
-    size = values.size
-    result = np.zeros(size, values.dtype)
-    own = np.empty(size)
-    top = -np.inf
-    for i in range(size):
-        own[i] = np.log(values[i].real) if values[i].real > 0 else -np.inf
-        top = max(top, own[i] + logs[i].real)
-    mass = 0.0 * values[0]
-    if not (-np.inf < top < np.inf):
-        return values, mass - np.inf, np.inf, np.inf
-    for i in range(size):
-        if own[i] > -np.inf and logs[i].real > -np.inf:
-            # Relative to the largest product: neither factor needs to be a number there.
-            result[i] = weights[i] * (values[i] / np.exp(own[i]) * np.exp(own[i] + logs[i] - top))
-            mass += result[i]
-    depth, growth, reference = 0.0, 0.0, np.log(largest)
-    for i in range(size):
-        result[i] /= mass
-        growth += weights[i] * np.exp(min(logs[i].real + reference - top - np.log(mass.real), 80.0))
-        if result[i].real > 0:
-            depth += result[i].real * (reference - own[i])
-    return result, np.log(mass) + top, depth, growth
+    with np.errstate(all="ignore"):
+        own, reference = np.where(density.real > 0, np.log(density.real), -np.inf), np.log(largest)
+        top = np.max(own + logs.real)
+        if not np.isfinite(top):
+            return density, 0.0 * density[0] - np.inf, np.inf, np.inf
+        # Relative to the largest product: neither factor needs to be a number there.
+        result = weights * (density / np.exp(own) * np.exp(own + logs - top))
+        result = np.where((own > -np.inf) & (logs.real > -np.inf), result, 0.0)
+        mass = np.sum(result)
+        result = result / mass
+        growth = np.sum(weights * np.exp(np.minimum(logs.real + reference - top - np.log(mass.real), 80.0)))
+        depth = np.sum(np.where(result.real > 0, result.real * (reference - own), 0.0))
+    return result, np.log(mass) + top, float(depth), float(growth)
 
 
 def _placed(values: Array, window: lw.Window, likelihood: Likelihood) -> lw.Window:
@@ -245,7 +220,7 @@ def place(offsets: Array, logs: Array, likelihood: Likelihood, origin: float) ->
         return np.asarray(np.interp(points.reshape(-1), offsets, logs, left=-200.0, right=-200.0)).reshape(points.shape)
 
     cells = np.stack([offsets[:-1], offsets[1:]], axis=1)
-    for _ in range(LEVELS):
+    while True:
         product, bound, change = _surveyed(cells, prior, likelihood, origin)
         best = float(product.max())
         if not np.isfinite(best):
@@ -260,7 +235,7 @@ def place(offsets: Array, logs: Array, likelihood: Likelihood, origin: float) ->
         parts = np.stack([quarters[:, :-1], quarters[:, 1:]], axis=2).reshape(-1, 2)
         cells = np.concatenate([cells[~divide], parts])
     product, _, _ = _surveyed(cells, prior, likelihood, origin)
-    good = (product >= product.max() - 32.0).any(axis=1)
+    good = (product >= product.max() - DEPTH).any(axis=1)
     return float(cells[good, 0].min()), float(cells[good, 1].max()), float((cells[good, 1] - cells[good, 0]).min())
 
 

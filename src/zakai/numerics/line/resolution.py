@@ -17,6 +17,7 @@ RESOLVED = 1e-11  # spectrum or Legendre coefficient at the highest frequencies,
 EDGE_OF_ALIASING = 4.0  # spectra at the highest frequencies, whose waves reach the ends as well
 ROUNDING = 4e-16  # rounding error of a decomposition or an exponential, relative to the norm
 RELIABLE = 1e-3  # of the promised error: smaller estimates are not reported
+MAGNUS = 0.02  # of the tolerance that one substep of Magnus' series, or of a splitting beside a Gaussian kernel, may leave
 TRANSITION_SHARE = 0.1  # of the tolerance that a transition of its own kind may leave, or lose of the mass
 SMOOTHER_SHARE = 0.01  # of the error that an interval of a smoother may make: what modes and rounding may leave
 SUPPORT = 8.0  # standard deviations to the end of a density

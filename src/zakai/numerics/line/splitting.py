@@ -86,10 +86,10 @@ def divided(
     begin, phi, drift = density.copy(), np.empty(size), np.empty(size)
     b, first, second = np.empty(size), np.empty(size), np.empty(size)
     magnus, substeps = 0.0, 1.0  # pairs of averages, one after the other, or the mean
-    both, spreads = np.empty((3, 2, size if varying else 1)), np.empty(3)
+    both, spreads, linear = np.empty((3, 2, size if varying else 1)), np.empty(3), False
     if varying:
-        operators(table, c, averages[0], at, both, spreads)
-        mean_error, pair_error = averaging(density, both, spreads, spacing, closed)
+        linear = operators(table, c, averages[0], at, both, spreads)
+        mean_error, pair_error = averaging(density, both, spreads, linear, spacing, closed)
         if mean_error > most:
             magnus = max(np.ceil(1.1 * (pair_error / most) ** 0.25), 1.0)
     for _ in range(8):
@@ -120,8 +120,8 @@ def divided(
             rounding, clipped, spread, constant = rounding + noise, max(clipped, end), spread + own_spread, constant + added
             if varying and (magnus == 0.0 or i % 2 == 1):
                 if parts > 1:
-                    operators(table, c, weights, at, both, spreads)
-                mean_error, pair_error = averaging(density, both, spreads, spacing, closed)
+                    linear = operators(table, c, weights, at, both, spreads)
+                mean_error, pair_error = averaging(density, both, spreads, linear, spacing, closed)
                 time, pairs = time + (pair_error if magnus > 0.0 else mean_error), pairs + pair_error
             total = moments(density)[0]
             if not (1e-200 < total < 1e200):
@@ -237,18 +237,14 @@ def split(
                 return np.inf, 1.0
             clipped = max(clipped, density[j])
             density[j], outer, gauge = 0.0, -OVERFLOW, 0.0
-        early[j], late[j], joint[j], work[j] = outer - gauge, outer + gauge, 2.0 * outer, gauge
-        middle[j] = 4.0 * outer - correction * first[j] * first[j]
-    for exponents in (early, middle, late):
+        early[j], work[j], middle[j] = outer, gauge, 4.0 * outer - correction * first[j] * first[j]
+    for exponents in (early, work, middle):
         exponentiate(exponents)
-    if narrow:
-        exponentiate(work)
-    else:
-        work[:] = 1.0
-    if substeps > 1.0:
-        exponentiate(joint)
     for j in range(size):
-        density[j] *= early[j]
+        late[j], joint[j] = early[j] * work[j], early[j] * early[j]
+        density[j] *= early[j] / work[j]
+    if not narrow:
+        work[:] = 1.0
     variance = part / (spacing * spacing)
     # Between exponentials of such a slope the kernel is as wide, about a mean that the slope displaces.
     taps = taps_of(variance, 0.5 * (np.sqrt(2.0 * depth) + steepest * np.sqrt(variance)) ** 2, size, narrow)
@@ -269,14 +265,13 @@ def split(
 
 
 _V, _M, _T = float64[::1], float64[:, ::1], float64[:, :, ::1]
-_DEPTH = 80.0  # logarithm below the maximum at which the samples of a kernel end
 
 
 class Interval(NamedTuple):
     """What the filter did in an interval on a grid.
 
     `observed` (m,) acts `inside` the interval or not at all; `pairs` of averages of the coefficients, zero for the mean, were
-    used in `substeps`, with a kernel that is `narrow` in spacings or not.
+    used in `substeps`, with a kernel that is `narrow` in spacings or not; `depth` as in `Accuracy`.
     """
 
     length: float
@@ -287,6 +282,7 @@ class Interval(NamedTuple):
     pairs: int
     substeps: int
     narrow: bool
+    depth: float
 
 
 class TangentCoefficients(NamedTuple):
@@ -376,7 +372,7 @@ def _split(interval: Interval, average: _Average, v: Array, dv: Array) -> tuple[
     variance, turned = float(variances[0].real), np.ascontiguousarray(variances.imag) / STEP
     change = np.abs(np.diff(phi[0].real)) + 5.0 * np.abs(np.diff(outer[0].real))
     steepest = float(np.max(change[v[1:] > 1e-13 * np.max(v)], initial=0.0))
-    taps = narrow_taps(variance) if interval.narrow else _samples(variance, steepest, len(v))
+    taps = narrow_taps(variance) if interval.narrow else _samples(variance, interval.depth, steepest, len(v))
     _along(v, dv, factors, slopes, *(np.ascontiguousarray(one[: len(v)]) for one in taps), turned, order)
     return v, dv
 
@@ -457,8 +453,8 @@ def _along(v: Array, dv: Array, factors: Array, slopes: Array, taps: Array, chan
             v[j] *= factors[which, j]
 
 
-def _samples(variance: float, steepest: float, most: int) -> tuple[Array, Array]:
+def _samples(variance: float, depth: float, steepest: float, most: int) -> tuple[Array, Array]:
     """Return up to `most` samples of a Gaussian between exponentials of a slope, and their derivatives in the variance."""
-    squares = np.arange(min(np.ceil(np.sqrt(2.0 * _DEPTH * variance) + steepest * variance) + 1.0, most)) ** 2
+    squares = np.arange(min(np.ceil(np.sqrt(2.0 * depth * variance) + steepest * variance) + 1.0, most)) ** 2
     taps = np.exp(-0.5 * squares / variance) / np.sqrt(2.0 * np.pi * variance)
     return taps, taps * 0.5 * (squares / variance - 1.0) / variance

@@ -21,12 +21,13 @@ from zakai.numerics.line.density import spectrum
 from zakai.numerics.line.grid_choice import FAR, log_likelihood
 from zakai.numerics.line.resolution import SPECTRUM_FACTOR
 
-COLUMNS = (
-    "gained", "mean", "variance", "aliasing", "edge", "negative", "time", "depth", "growth", "made", "error", "log_floor",
-    "start", "pairs", "substeps", "needed",
-)  # fmt: skip
+# The figures of a step's report; the last four are those of a splitting, and where its grid begins.
+(
+    GAINED, MEAN, VARIANCE, ALIASING, EDGE, NEGATIVE, TIME, DEPTH, GROWTH, MADE, ERROR, LOG_FLOOR, START, PAIRS, SUBSTEPS, NEEDED
+) = range(16)  # fmt: skip
+FIGURES = NEEDED + 1
 # The transition: whole with a sample after it, split with increments inside, whole with increments inside, split with a sample.
-FACTOR, SPLIT, KERNEL, SPLIT_FACTOR = 0, 1, 2, 3
+FACTOR, SPLIT, KERNEL, SPLIT_FACTOR = range(4)
 TABLE_MARGIN = 96  # points of a table of coefficients in time beyond the grid; a third may be used before it is made again
 
 
@@ -190,7 +191,7 @@ class Resolution(NamedTuple):
 
 
 class Segment(NamedTuple):
-    """The densities (K, N) after the first steps and their reports (K, len(COLUMNS)).
+    """The densities (K, N) after the first steps and their reports (K, FIGURES).
 
     The column `start` of a report is the first point of the grid in the table.  `status` is why the loop ended, and `answer` the
     range of the grid that it needs, relative to the centre of the present one, and its spacing.
@@ -203,7 +204,7 @@ class Segment(NamedTuple):
 
 
 IMPOSSIBLE = -1e8  # exponent where a formula has no value
-PHI, CELL, DRIFT, SLOPE, OBSERVED = 0, 1, 2, 3, 4  # rows of a term
+PHI, CELL, DRIFT, SLOPE, OBSERVED = range(5)  # rows of a term
 
 
 class Transition(NamedTuple):
@@ -274,8 +275,7 @@ def exponent_added(h: Array, centre: Array, precision: Array, observed: Array, w
 
 
 OVERFLOW = 690.0  # exponent below which exp is finite
-_LEAST = 1e-280  # value of a density where its product with a likelihood is largest
-_MOST_GROWTH = 1e80
+LEAST = 1e-240  # factor or value of a density whose products with all values that count are normal numbers
 
 
 @helper
@@ -377,7 +377,7 @@ def product(density: Array, b: Array) -> tuple[float, float, float]:
         logs[j] = np.log(density[j]) if density[j] > 0 else -np.inf
         if logs[j] + b[j] > best:
             best, top = logs[j] + b[j], j
-    if not (best < np.inf and density[top] > _LEAST):
+    if not (best < np.inf and density[top] > LEAST):
         return np.nan, growth, depth
     reference, scale, factors = np.log(largest), 1.0 / density[top], np.empty(density.size)
     for j in range(density.size):
@@ -391,4 +391,4 @@ def product(density: Array, b: Array) -> tuple[float, float, float]:
         density[j] /= total
         if density[j] > 0:
             depth += density[j] * (reference - logs[j])
-    return np.log(total) + best, min(growth / total * largest * scale, _MOST_GROWTH), depth
+    return np.log(total) + best, growth / total * largest * scale, depth

@@ -17,10 +17,10 @@ from scipy.special import erfc
 
 from zakai.numerics.arrays import Array
 from zakai.numerics.complex_step import STEP
-from zakai.numerics.line.modes import FALL
+from zakai.numerics.line.modes import FALL, gathered
 from zakai.numerics.line.operator import Spectral, quotients
 from zakai.numerics.line.resolution import ROUNDING
-from zakai.numerics.line.window import CUT, SMALL, Window, density_at, gathered, interpolated, local_polynomial
+from zakai.numerics.line.window import CUT, SMALL, Window, density_at, interpolated, local_polynomial
 
 
 class Varied(NamedTuple):
@@ -44,7 +44,7 @@ class Varied(NamedTuple):
         length: float,
         window: Window | None = None,
         own: Window | None = None,
-        margins: tuple[int, int] = (0, 0),
+        margin: int = 0,
     ) -> tuple[Array, Array]:
         """Return a density (N,) after a time, and its derivatives (p, N).
 
@@ -53,7 +53,7 @@ class Varied(NamedTuple):
             tangents: its derivatives (p, J).
             length: the time.
             window, own: the grid of the density and that of the decomposition, where they differ.
-            margins: the numbers of points at the two ends of the latter at which there is no density after the time.
+            margin: the number of points at either end of the latter at which there is no density after the time.
         """
         U, rates, top = self.modes.modes, self.modes.rates, int(np.argmax(values))
         if window is None or own is None or window == own:
@@ -68,14 +68,14 @@ class Varied(NamedTuple):
             scales, shifts = self.scales - shifts[:, top : top + 1], shifts - shifts[:, top : top + 1]
             result = np.where(used, np.concatenate([values[None], tangents - values * shifts]) / at, 0.0)
             # Interpolation leaves waves everywhere; where they end abruptly, the derivatives spread that.
-            inner, *rest = np.array([gathered(one, points, own) for one in result]) * _faded(own.size, margins)
+            inner, *rest = np.array([gathered(one, points, own) for one in result]) * _faded(own.size, margin)
             changes = np.array(rest)
         decay, coefficients = np.exp(-length * rates), inner @ U
         turned = (self.operators * quotients(rates, decay, length)) @ coefficients
         after = U @ (decay * coefficients)
         # Beyond the support there is only rounding, which the scale must not amplify.
         noise = ROUNDING * np.sqrt(np.sum(inner * inner)) * max(1.0, decay[0])
-        seen, place = np.flatnonzero(after[margins[0] : len(after) - margins[1]] > noise) + margins[0], np.arange(len(after))
+        seen, place = np.flatnonzero(after[margin : len(after) - margin] > noise) + margin, np.arange(len(after))
         first, last = seen[[0, -1]] if len(seen) else (np.nan, np.nan)
         scale = np.where((place < first) | (place > last), 0.0, scale if len(seen) else np.nan)
         return scale * after, scale * (((changes @ U) * decay + turned) @ U.T + after * scales)
@@ -108,11 +108,8 @@ def resampled_tangents(values: Array, tangents: Array, window: Window, new: Wind
     return np.ascontiguousarray(result * (new.spacing / window.spacing))
 
 
-def _faded(size: int, margins: tuple[int, int]) -> Array:
+def _faded(size: int, margin: int) -> Array:
     """Return factors (N,) that fall to zero at the two ends of a grid."""
-    result = np.ones(size)
-    for margin, end in zip(margins, (result, result[::-1]), strict=True):
-        end[:margin] = 0.5 * erfc(FALL * np.linspace(1.0, -1.0, margin, endpoint=False))
+    result, fall = np.ones(size), 0.5 * erfc(FALL * np.linspace(1.0, -1.0, margin, endpoint=False))
+    result[:margin], result[size - margin :] = fall, fall[::-1]
     return result
-
-

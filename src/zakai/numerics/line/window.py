@@ -56,13 +56,12 @@ def _nearest(values: Array, window: Window, at: Array) -> tuple[Array, Array]:
 
 Operator = Array | FourierOperator
 
-SIZES = (32, 48, 64, 80, 96, 112, 128, 160, 192, 256, 384, 512, 768, 1024, 1536, 2048, 3072, 4096)
+SIZES = (32, 48, 64, 80, 96, 112, 128, 160, 192, 256, 320, 384, 512, 768, 1024, 1536, 2048, 3072, 4096)
 LARGEST = 384  # points of a grid on which matrices propagate densities
 LARGE = 1024  # points of a grid on which matrices propagate messages, and kernels and splitting densities
 CUT = 1e-13  # density relative to its maximum that a new grid must hold
 DEEP = 1e-20  # the same of densities whose small values are accurate
 SMALL = 1e-8  # density relative to its maximum below which its logarithm is interpolated
-POINTS_TOGETHER = 256  # points at which values of a large grid are interpolated together
 ALIGNMENT = 8  # centres are at multiples of so many spacings
 
 
@@ -191,14 +190,13 @@ def grid_check(values: Array, closed: bool, negligible: float = CUT, cut: float 
     return GridCheck(left, right, int(first), int(last), negative, aliasing, rough, float(resolving))
 
 
-def fitted(check: GridCheck, window: Window, most: int = LARGEST, generous: int = 64, margin: float = 0.12) -> Window:
+def fitted(check: GridCheck, window: Window, most: int = LARGEST, generous: int = 64) -> Window:
     """Return the grid to go on with: the same where it serves, else one that fits the density.
 
     Args:
         check: the figures of the density.
         most: the largest size.
         generous: a grid of up to so many points is kept though fewer would do.
-        margin: range of a new grid beyond that of the density, relative to it.
     """
     needed = check.resolving * window.spacing
     if not 0.0 < needed < np.inf:  # the values are not finite
@@ -221,9 +219,7 @@ def fitted(check: GridCheck, window: Window, most: int = LARGEST, generous: int 
     needed = max(needed, window.spacing * width / (most - 12) * 1.12 * 2**0.25)
     low = window.centre + window.spacing * (first - window.size // 2)
     high = window.centre + window.spacing * (last - window.size // 2)
-    if margin * (high - low) / needed > 0.5 * (most - (high - low) / needed):
-        margin = 0.12
-    return quantized(window, low, high, needed, margin, most)
+    return quantized(window, low, high, needed, most=most)
 
 
 def enlarged(window: Window, left: bool, right: bool) -> Window:
@@ -251,8 +247,8 @@ def refined(window: Window, factor: float = 2**0.5) -> Window:
 
 def interpolated(values: Array, window: Window, offsets: Array) -> Array:
     """Return the interpolants of values (..., N) at offsets (J,) from the origin."""
-    if len(offsets) > POINTS_TOGETHER and window.size > LARGE:
-        parts = np.array_split(offsets, -(-len(offsets) // POINTS_TOGETHER))
+    if len(offsets) > LARGEST and window.size > LARGE:
+        parts = np.array_split(offsets, -(-len(offsets) // LARGEST))
         return np.concatenate([interpolated(values, window, part) for part in parts], axis=-1)
     at = (offsets - window.centre) / window.spacing + window.size // 2
     nearest = np.round(at)
@@ -271,21 +267,6 @@ def interpolated(values: Array, window: Window, offsets: Array) -> Array:
     inside = (at > -0.5) & (at < window.size - 0.5)
     own = values[..., np.where(inside, nearest, 0.0).astype(int)]
     return np.asarray(np.where(inside, np.where(exact, own, result), 0.0))
-
-
-def gathered(values: Array, offsets: Array, window: Window) -> Array:
-    """Return the values (J,) at offsets, times the matrix of interpolation from a grid on the line to them: (N,)."""
-    at = (offsets - window.centre) / window.spacing + window.size // 2
-    nearest = np.round(at)
-    distance = at[:, None] - np.arange(window.size)
-    exact = np.abs(at - nearest) < 1e-12
-    sine = np.where(exact, 0.0, np.sin(np.pi * (at - nearest)) * np.where(nearest % 2 == 0, 1.0, -1.0))
-    signs = np.where(np.arange(window.size) % 2 == 0, 1.0, -1.0)
-    with np.errstate(divide="ignore"):
-        inverse = np.where(exact[:, None], 0.0, 1.0 / distance)
-    result = (values * sine / np.pi) @ inverse * signs
-    np.add.at(result, nearest[exact].astype(int), values[exact])
-    return np.asarray(result)
 
 
 def resampled(values: Array, window: Window, new: Window) -> Array:
