@@ -167,10 +167,38 @@ class Element(NamedTuple):
         """Return the matrix (J, N) from values to those of the polynomials at points (J,)."""
         return interpolation(self.points, self.weights, points)
 
+    def panel(self, points: Array) -> Array:
+        """Return the interval (J,) in which points are."""
+        return np.searchsorted(np.asarray(self.cuts), points, side="right")
+
     def at(self, values: Array, points: Array) -> Array:
         """Return the density at points (J,) from probabilities; zero beyond the ends."""
-        inside = (points >= self.lower) & (points <= self.upper)
-        return np.asarray(np.where(inside, self.interpolation(points) @ (values / self.weights), 0.0))
+        inside, panel = (points >= self.lower) & (points <= self.upper), self.panel(points)
+        apart = points[:, None] - self.points.reshape(-1, self.size)[panel]
+        same = np.abs(apart) <= _NEAR * self.halves[panel, None]
+        terms = np.where(same.any(axis=1)[:, None], same, _barycentric(rule(self.size).weights) / np.where(same, 1.0, apart))
+        own = (values / self.weights).reshape(-1, self.size)[panel]
+        return np.asarray(np.where(inside, np.sum(terms * own, axis=1) / np.sum(terms, axis=1), 0.0))
+
+    def finer(self, values: Array, size: int) -> Array:
+        """Return the polynomials with values (N,) at as many other points in each interval."""
+        own = rule(self.size)
+        return np.asarray((values.reshape(-1, self.size) @ interpolation(own.points, own.weights, rule(size).points).T).reshape(-1))
+
+    def sums(self, values: Array) -> Array:
+        """Return the sums over the points of each interval (P,)."""
+        return values.reshape(-1, self.size).sum(axis=1)
+
+    def tails(self, values: Array) -> Array:
+        """Return the highest Legendre coefficients of each interval (P,): |c_n| + |c_n-1|, or a tenth of the two before."""
+        fourth, third, second, first = np.abs(values.reshape(-1, self.size) @ rule(self.size).analysis[-4:].T).T
+        return np.maximum(first + second, 0.1 * (third + fourth))
+
+    def bisected(self, where: Array) -> Element:
+        """Return the element with some of its intervals (P,) bisected."""
+        ends = np.array([self.lower, *self.cuts, self.upper])
+        middles = 0.5 * (ends[1:] + ends[:-1])[where]
+        return self._replace(cuts=tuple(np.sort(np.concatenate([ends[1:-1], middles])).tolist()))
 
     def unresolved(self, values: Array) -> float:
         """Return the largest Legendre coefficient in the highest eighth, relative to the largest of all."""

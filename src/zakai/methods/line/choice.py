@@ -19,7 +19,7 @@ from zakai.methods.line.prepared import Prepared, TimeInterval
 from zakai.methods.line.report import Report
 from zakai.methods.line.transition import Prediction, by_decomposition, by_substeps
 from zakai.methods.line.update import refitted
-from zakai.methods.line.volumes import contracted
+from zakai.methods.line.panels import contracted
 from zakai.numerics.arrays import Array
 from zakai.numerics.line import window as lw
 from zakai.numerics.line.gaussian_kernels import Channel
