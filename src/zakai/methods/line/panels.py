@@ -73,6 +73,13 @@ class Problem(NamedTuple):
             parts = resolved_parts(prepared, values, points, interval)
         return cls(prepared, interval, density, points.points, float(ends[0]), float(ends[1]), parts)
 
+    @classmethod
+    def of_grid(cls, prepared: Prepared, interval: TimeInterval, values: Array, window: lw.Window) -> Problem:
+        """Return the problem for the probabilities of a uniform grid."""
+        check = lw.grid_check(values, False)
+        ends = window.points[[max(check.first - 1, 0), min(check.last + 1, window.size - 1)]]
+        return cls.of(prepared, interval, window, values, lambda x: lw.density_at(values, window, x - window.origin), ends)
+
     @property
     def backward(self) -> bool:
         """Whether a message is taken to the start."""
@@ -110,6 +117,10 @@ class Solution(NamedTuple):
     def at(self, points: Array) -> Array:
         """Return the values at states (J,), zero beyond the panels."""
         return self.element.at(self.values * self.element.weights, points)
+
+    def extended(self, points: Array) -> Array:
+        """Return the values at states (J,), beyond the panels those at their ends."""
+        return self.at(np.clip(points, self.element.lower, self.element.upper))
 
 
 class _Operator:
@@ -317,6 +328,21 @@ def _differences(problem: Problem, first: Solution, second: Solution) -> Array:
     return second.element.sums(weights * np.abs(other - second.values.real))
 
 
+SMOOTH = 1e-7  # error of a backward interval that is allowed
+
+
+def pulled_back(problem: Problem, logs: Function, probes: Array) -> Solution | None:
+    """Return the expectation of a function of the state after an interval, given the state before; None where there is none.
+
+    Args:
+        problem: that of the density before the interval.
+        logs: the logarithm of the function at states (J,), smooth between `probes`.
+    """
+    top = float(np.max(logs(probes)))
+    result = settled(problem._replace(message=lambda x: np.exp(logs(x) - top), probes=probes), SMOOTH)
+    return None if result is None else result._replace(log_scale=result.log_scale + top)
+
+
 APART = 1e-6  # of the range: ends of panels that are nearer to each other are one
 PROBES = 65  # points between which a formula ceases to have values
 
@@ -396,10 +422,7 @@ def contracted(
     # Panels do not bring back what the grid does not resolve.
     allowed = TRANSITION_SHARE * max(prepared.tolerance, check.aliasing)
 
-    def density(x: Array) -> Array:
-        return lw.density_at(values, window, x - window.origin)
-
-    problem = Problem.of(prepared, interval, window, values, density, ends)
+    problem = Problem.of_grid(prepared, interval, values, window)
     solution = settled(problem, allowed)
     if solution is None or any(_reached(problem, solution)):
         return None
