@@ -18,7 +18,7 @@ about
 
     e^p,    p = (kappa - 1) / (kappa + 1 - k).
 
-At the limit of Feller, kappa = 1, that is no small number for any e.  Finite volumes without flux at their ends lose nothing.
+At the limit of Feller, kappa = 1, that is no small number for any e.  Panels without flux at their ends lose nothing.
 """
 
 from __future__ import annotations

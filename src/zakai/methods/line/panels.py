@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from zakai.methods.line.cache import Derived
 from zakai.methods.line.coefficients import coefficients, covariance_at, resolved_parts
 from zakai.methods.line.domain import ends_of_leak
 from zakai.methods.line.model import MOST_KINKS, finite, within
@@ -21,9 +22,9 @@ from zakai.methods.line.report import Report
 from zakai.methods.line.transition import Prediction
 from zakai.numerics.arrays import Array, Number
 from zakai.numerics.line import window as lw
-from zakai.numerics.line.averages import GAUSS_NODES, GAUSS_WEIGHTS, Panels, interpolation
-from zakai.numerics.line.rational import FINE, STABLE, Poles, exponential, joined, separated, weak_form
-from zakai.numerics.line.resolution import RESOLVED, ROUNDING, TRANSITION_SHARE
+from zakai.numerics.line.averages import GAUSS_NODES, Panels, interpolation
+from zakai.numerics.line.rational import COLLOCATION, CONTRACTION, Factors, collocated, joined, separated, weak_form
+from zakai.numerics.line.resolution import RESOLVED, ROUNDING, SUPPORT, TRANSITION_SHARE
 from zakai.numerics.lobatto import Element
 
 Function = Callable[[Array], Array]
@@ -33,16 +34,19 @@ FIRST_PANELS = 8  # of equal length
 TAIL = 10.0  # allowed errors that a panel may leave unresolved: the error that remains after an interval is far smaller
 TIGHTER = 0.03  # that where two solutions differ too much, relative to that before
 LEVELS = 3  # pairs of solutions that are compared
+GROSS = 1e-2  # share of the function that a panel leaves unresolved, which shows in all others
 WORST = 0.03  # of the worst panel: what others leave unresolved that are bisected with it
 ROUNDS = 40  # of bisection
 MOST_PANELS = 1000
 EDGE = 1e-9  # density at the ends of panels, relative to the maximum, beyond which they are too few
 MUCH = 1e-3  # probability of an outermost panel beyond which the panels are too few before they are too long
 FASTEST = 100.0  # rate at which the drift contracts, times the length of the interval and the tolerance, that no faster one exceeds
-MOST_STEPS = 60, 1000  # in time, with the poles for contraction and for motion
-LEAST_STEP = 1e-12  # of the interval
-LEAST_SHARE = 0.01  # of the allowed error that a step may make however short it is
-COARSE_STEP = 30.0  # allowed errors by which a step may differ from two halves, whose error is far smaller
+RATIO, FINER = 2.0, 1.2  # of the lengths of steps in time
+FIRST = 0.1  # of the time in which the drift would cross the range of the density, and of the interval: the first step
+REACH = 7.0  # standard deviations of the noise beyond the density before, between which the first panels lie
+DIFFUSED = 0.5  # of the time in which noise would double the variance: the first step
+MOST_STEPS = 1000  # in time, beyond which none is divided
+LEAST_STEP = 1e-9  # of the interval
 SETTLED = 1e-2  # error above which panels do not serve
 
 
@@ -50,7 +54,7 @@ class Problem(NamedTuple):
     """What an interval does to the density before it, or to a `message`, what a state is worth at the end, backward.
 
     Both are functions of states (J,), smooth between `probes`.  The density before lies between `low` and `high`, and `after` is the
-    one after the interval.  The coefficients are polynomials of time in each of the `parts`.
+    one after the interval.  The coefficients are polynomials of time in each of the `parts`; the first step in time is `quick`.
     """
 
     prepared: Prepared
@@ -60,6 +64,8 @@ class Problem(NamedTuple):
     low: float
     high: float
     parts: Panels
+    quick: float
+    reach: float
     message: Function | None = None
     after: Function | None = None
 
@@ -68,10 +74,16 @@ class Problem(NamedTuple):
         cls, prepared: Prepared, interval: TimeInterval, points: lw.Points, values: Array, density: Function, ends: Array
     ) -> Problem:
         """Return the problem for the probabilities (N,) of points, between two ends."""
-        parts = Panels([(0.0, interval.length)], 0.0)
+        parts, theta, (low, high) = Panels([(0.0, interval.length)], 0.0), prepared.theta.real, ends.tolist()
         if prepared.system.varying:
             parts = resolved_parts(prepared, values, points, interval)
-        return cls(prepared, interval, density, points.points, float(ends[0]), float(ends[1]), parts)
+        drift = np.max(np.abs(finite(prepared.system.drift(ends[:, None], interval.start, theta)[:, 0])))
+        top = points.points[[int(np.argmax(values.real))]]
+        noise = float(np.max(covariance_at(prepared.system, top, interval.start, theta)))
+        rate = max(min(drift / (high - low), FASTEST / (interval.length * prepared.tolerance)), 1.0 / interval.length)
+        diffused = DIFFUSED * ((high - low) / (2.0 * SUPPORT)) ** 2 / max(noise, 1e-300)
+        reach = REACH * float(np.sqrt(noise * interval.length))
+        return cls(prepared, interval, density, points.points, low, high, parts, min(FIRST / rate, float(diffused)), reach)
 
     @classmethod
     def of_grid(cls, prepared: Prepared, interval: TimeInterval, values: Array, window: lw.Window) -> Problem:
@@ -123,8 +135,8 @@ class Solution(NamedTuple):
         return self.at(np.clip(points, self.element.lower, self.element.upper))
 
 
-class _Operator:
-    """The operator on panels: M, r, and B of steps."""
+class Operator:
+    """The operator on panels: M, r, and h B."""
 
     def __init__(self, problem: Problem, element: Element) -> None:
         self.problem, self.element, self.offset = problem, element, 0.0
@@ -133,9 +145,10 @@ class _Operator:
         centre, reach = 0.5 * (problem.low + problem.high), 0.5 * (problem.high - problem.low)
         rate = FASTEST / (length * prepared.tolerance)
         self.fastest = rate * np.maximum(np.abs(element.points - centre), reach)
-        G, _, V = self.at(np.array([start]))
+        G, f, V = self.at(np.array([start]))
         if inside.any():
             self.offset = float(np.max(V[0].real[self.before.real > 1e-6 * self.before.real.max()]))
+        self.begin = G, f, V - self.offset
         ends = G[0].reshape(-1, element.size)
         left, right = ends[:-1, -1], ends[1:, 0]
         ratios = np.where(right.real > 0.0, left, 1.0) / np.where(right.real > 0.0, right, 1.0)
@@ -152,21 +165,19 @@ class _Operator:
         covariance = covariance if covariance.ndim == 2 else covariance[:, None]
         return np.broadcast_to(covariance, drift.shape), drift, potential + constant[:, None] - self.offset
 
-    def part(self, low: float, high: float) -> Callable[[float, float], list[Array]]:
-        """Return the function that gives the B h of the exponentials of a step, between two times of a part of the interval."""
-        problem, start = self.problem, self.problem.interval.start
-        varying = problem.prepared.system.varying
-        times = start + low + (high - low) * GAUSS_NODES if varying else np.array([start])
-        known = self.at(within(times, start + low, start + high))
+    def part(self, low: float, high: float) -> Callable[[Array, float], Array]:
+        """Return the function that gives h B at times after the start (T, P, n, n), within a part of the interval.
 
-        def blocks(first: float, last: float) -> list[Array]:
-            weights = np.full((1, 1), last - first)
-            if varying:  # Magnus' integrator of order four without commutators
-                moment = 2.0 * (GAUSS_NODES - 0.5)
-                nodes = interpolation((first - low + (last - first) * GAUSS_NODES) / (high - low))
-                weights = (last - first) * (GAUSS_WEIGHTS * np.array([0.5 - moment, 0.5 + moment])) @ nodes
-            result = [weak_form(self.element, *(w @ one for one in known), self.scale) for w in weights]
-            return [np.ascontiguousarray(B.transpose(0, 2, 1)) for B in result[::-1]] if problem.backward else result
+        Where no coefficient depends on time it gives one.
+        """
+        varying, start = self.problem.prepared.system.varying, self.problem.interval.start
+        times = within(start + low + (high - low) * GAUSS_NODES, start + low, start + high)
+        coefficients = self.at(times) if varying else self.begin
+
+        def blocks(times: Array, step: float) -> Array:
+            weights = step * (interpolation((times - low) / (high - low)) if varying else np.ones((1, 1)))
+            result = np.stack([weak_form(self.element, *(w @ one for one in coefficients), self.scale) for w in weights])
+            return result.swapaxes(-1, -2) if self.problem.backward else result
 
         return blocks
 
@@ -174,54 +185,61 @@ class _Operator:
 JUMP = 1e-5  # relative difference of G on both sides of a cut from which it is a jump
 
 
-def _solved(problem: Problem, element: Element, poles: Poles, allowed: float, least: int) -> Solution | None:
-    """Return the function after the interval on panels, by at least so many steps; None where these are too many.
+def _ends_of_steps(problem: Problem, ratio: float) -> Array:
+    """Return the ends (T + 1,) of steps between the parts, longer than the one before by at most a ratio, backward at both ends."""
+    length = problem.interval.length
+    count = int(np.ceil(np.log(length / problem.quick) / np.log(ratio)))
+    ends = length * (problem.quick / length) ** np.linspace(1.0, 0.0, count + 1)
+    bounds = [0.0, *(stop for _, stop in problem.parts.bounds)]
+    return np.unique(np.concatenate([bounds, ends[:-1], length - ends[:-1] if problem.backward else []]))
 
-    Steps with the poles for motion are compared with two halves, as those with coefficients of time, which are extrapolated.
+
+def _solved(problem: Problem, element: Element, ratio: float, least: int = 1) -> Solution | None:
+    """Return the function after the interval on panels, None where there is none.
+
+    Args:
+        ratio: of the lengths of steps of collocation; zero for exponentials, where no coefficient depends on time.
+        least: the number of exponentials.
     """
-    operator = _Operator(problem, element)
-    masses, backward, varying = operator.masses, problem.backward, problem.prepared.system.varying
-    compared, order = varying or poles is STABLE, 5.0 if varying else 8.0
-    quadrature = joined(element, element.weights)
-    mass, x = joined(element, masses), joined(element, element.weights * element.points) / quadrature
-    values = (problem.message or problem.density)(element.points)
+    operator = Operator(problem, element)
+    masses, backward, quadrature = operator.masses, problem.backward, joined(element, element.weights)
+    mass, values = joined(element, masses), (problem.message or problem.density)(element.points)
     v = joined(element, element.weights * values) / (quadrature if backward else mass)
 
     def size(v: Array) -> Number:
         return np.max(v.real) if backward else np.sum(mass * v)
 
-    def advanced(v: Array, steps: list[tuple[float, float]]) -> Array:
-        for step in steps[::-1] if backward else steps:
-            for B in blocks(*step):
-                v = exponential(element, B, masses, 1.0, poles, v)
-        return v
-
-    v, gained = v / size(v), np.log(size(v)) if backward else 0.0 * size(v)
-    length, left = problem.interval.length, MOST_STEPS[poles is STABLE]
-    for low, high in problem.parts.bounds[::-1] if backward else problem.parts.bounds:
-        blocks, done, step = operator.part(low, high), 0.0, (high - low) / least
-        while done < high - low:
-            left, step = left - 1, min(step, high - low - done)
-            first = high - done - step if backward else low + done
-            middle, last = first + 0.5 * step, first + step
-            result, error, wanted = advanced(v, [(first, last)]), 0.0, allowed * max(step / length, LEAST_SHARE)
-            if compared:
-                fine = advanced(v, [(first, middle), (middle, last)])
-                change = np.abs((fine - result).real)
-                weighted = np.max(change) if backward else (mass.real * _importance(x, mass.real * fine.real)) @ change
-                error = float(weighted / np.abs(size(fine).real)) / (15.0 if varying else COARSE_STEP)
-                result = (16.0 * fine - result) / 15.0 if varying else fine
-            scale = size(result)
-            if left < 0 or step < LEAST_STEP * length or not (compared or scale.real > 0.0):
-                return None
-            if not (error <= wanted and scale.real > 0.0):
-                step *= max(0.1, 0.8 * (wanted / error) ** (1.0 / order)) if error < np.inf else 0.1
+    gained = np.log(size(v)) if backward else 0.0 * size(v)
+    v = v / size(v)
+    ends = _ends_of_steps(problem, ratio) if ratio else np.linspace(0.0, problem.interval.length, least + 1)
+    steps, part, factors = list(zip(ends[:-1], ends[1:], strict=True)), (0.0, 0.0), None
+    steps = steps if backward else steps[::-1]
+    while steps:
+        first, last = steps.pop()
+        step = last - first
+        if not part[0] <= 0.5 * (first + last) <= part[1]:
+            part = next(bounds for bounds in problem.parts.bounds if bounds[0] <= 0.5 * (first + last) <= bounds[1])
+            blocks = operator.part(*part)
+        if ratio:
+            at = last - step * COLLOCATION.nodes if backward else first + step * COLLOCATION.nodes
+            found = collocated(element, blocks(at, step), masses, v)
+            if found is None:
+                middle = 0.5 * (first + last)
+                if len(steps) > MOST_STEPS or step < LEAST_STEP * problem.interval.length:
+                    return None
+                steps += [(first, middle), (middle, last)] if backward else [(middle, last), (first, middle)]
                 continue
-            done = high - low if step >= high - low - done else done + step
-            step *= min(4.0, 0.8 * (wanted / max(error, 1e-300)) ** (1.0 / order)) if compared else 1.0
-            v, gained = result / scale, gained + np.log(scale)
+            v = found
+        else:
+            factors = factors or Factors.of(element, blocks(ends[:1], step)[0], masses, CONTRACTION.values)
+            v = factors.exponential(v)
+        scale = size(v)
+        if not scale.real > 0.0:
+            return None
+        v, gained = v / scale, gained + np.log(scale)
     u = separated(element, v)
-    return Solution(element, u if backward else u * np.repeat(operator.scale, element.size), gained + operator.offset * length)
+    u = u if backward else u * np.repeat(operator.scale, element.size)
+    return Solution(element, u, gained + operator.offset * problem.interval.length)
 
 
 def _unresolved(problem: Problem, element: Element, values: Array, after: bool) -> Array:
@@ -230,8 +248,9 @@ def _unresolved(problem: Problem, element: Element, values: Array, after: bool) 
 
 
 def _coarse(unresolved: Array, limit: float) -> Array:
-    """Return which panels (P,) are bisected: the worst first, for what they leave unresolved shows in all others."""
-    return np.asarray(unresolved > max(limit, WORST * float(np.max(unresolved))))
+    """Return which panels (P,) are bisected: first the worst where what they leave unresolved shows in all others."""
+    worst = float(np.max(unresolved))
+    return np.asarray(unresolved > max(limit, WORST * worst if worst > GROSS else 0.0))
 
 
 def _began(problem: Problem, element: Element, limit: float) -> Element:
@@ -251,10 +270,10 @@ def _began(problem: Problem, element: Element, limit: float) -> Element:
     return element
 
 
-def _ended(problem: Problem, element: Element, poles: Poles, limit: float, allowed: float) -> Solution | None:
+def _ended(problem: Problem, element: Element, ratio: float, limit: float) -> Solution | None:
     """Return the solution on panels that hold and resolve the function after the interval, too; None where there is none."""
     for _ in range(ROUNDS):
-        solution = _solved(problem, element, poles, allowed, 1)
+        solution = _solved(problem, element, ratio)
         if solution is None:
             return None
         sides = (False, False) if problem.backward else _reached(problem, solution)
@@ -267,7 +286,7 @@ def _ended(problem: Problem, element: Element, poles: Poles, limit: float, allow
         else:
             left, right = 4.0 * element.halves[[0, -1]] * sides
             ends = element.lower, *element.cuts, element.upper
-            element = _within(problem, element.lower - left, element.upper + right, ends)
+            element = panels_between(problem.prepared, element.lower - left, element.upper + right, problem.interval.start, ends)
     return solution
 
 
@@ -279,33 +298,34 @@ def _reached(problem: Problem, solution: Solution) -> tuple[bool, bool]:
     return bool(left and element.lower > low), bool(right and element.upper < high)
 
 
-def _within(problem: Problem, low: float, high: float, cuts: tuple[float, ...] = ()) -> Element:
+def panels_between(prepared: Prepared, low: float, high: float, t: float, cuts: tuple[float, ...] = ()) -> Element:
     """Return panels between two states in the domain, with ends at kinks, at `cuts`, or else of equal length."""
-    prepared, start = problem.prepared, problem.interval.start
-    middle = 0.5 * (problem.low + problem.high)
+    middle, more = 0.5 * (low + high), np.array(cuts) if cuts else np.linspace(low, high, FIRST_PANELS + 1)
     low, high = np.clip([low, high], *domain_of(prepared)).tolist()
-    low, high = (_defined(prepared, middle, end, start) for end in (low, high))
-    more = cuts or np.linspace(low, high, FIRST_PANELS + 1)[1:-1]
-    ends, apart = np.append(kinks_between(prepared, low, high, start), more), APART * (high - low)
-    ends = np.unique(ends[(ends > low + apart) & (ends < high - apart)])
-    return Element(low, high, SIZES[0], tuple(ends[np.diff(ends, prepend=-np.inf) > apart].tolist()))
+    low, high = (_defined(prepared, middle, end, t) for end in (low, high))
+    ends, apart = np.array([low, *kinks_of(prepared, low, high, t), high]), APART * (high - low)
+    more = more[np.min(np.abs(more[:, None] - ends), axis=1) > apart]
+    ends = np.sort(np.append(ends[(ends > low + apart) & (ends < high - apart)], more[(more > low) & (more < high)]))
+    return Element(low, high, SIZES[0], tuple(ends.tolist()))
 
 
 def settled(problem: Problem, allowed: float) -> Solution | None:
     """Return the function after the interval on more panels until two solutions differ by less than allowed, or by the least."""
-    element, best = _within(problem, problem.low, problem.high), None
-    for poles in (FINE, STABLE):
+    first, best = np.linspace(problem.low, problem.high, FIRST_PANELS + 1), None
+    reach = problem.reach * np.array([-1.0, 1.0])
+    element = panels_between(problem.prepared, *(first[[0, -1]] + reach), problem.interval.start, tuple(first.tolist()))
+    for ratio in (0.0, RATIO)[problem.prepared.system.varying :]:
         limit, before = TAIL * allowed, np.inf
         if problem.backward:
-            forward = _ended(problem._replace(message=None), element, poles, limit, allowed)
+            forward = _ended(problem._replace(message=None), element, ratio, limit)
             if forward is None:
                 continue
             problem, element = problem._replace(after=forward.at), forward.element
         for _ in range(LEVELS):
-            first = _ended(problem, _began(problem, element, limit), poles, limit, allowed)
+            first = _ended(problem, _began(problem, element, limit), ratio, limit)
             if first is None:
                 break
-            second = _solved(problem, first.element._replace(size=SIZES[1]), poles, 0.1 * allowed, 2)
+            second = _solved(problem, first.element._replace(size=SIZES[1]), ratio**0.5, 2)
             if second is None:
                 break
             parts, element = _differences(problem, first, second), first.element
@@ -316,6 +336,9 @@ def settled(problem: Problem, allowed: float) -> Solution | None:
                 return best
             if error > 0.3 * before:
                 break
+            if ratio == RATIO:
+                ratio = FINER
+                continue
             before, limit = error, TIGHTER * limit
             element = element.bisected(parts > 0.5 * allowed / len(parts))
     return best if best is not None and best.error < SETTLED else None
@@ -338,8 +361,13 @@ def pulled_back(problem: Problem, logs: Function, probes: Array) -> Solution | N
         problem: that of the density before the interval.
         logs: the logarithm of the function at states (J,), smooth between `probes`.
     """
-    top = float(np.max(logs(probes)))
-    result = settled(problem._replace(message=lambda x: np.exp(logs(x) - top), probes=probes), SMOOTH)
+    known = logs(probes)
+    top = float(np.max(known))
+    p = np.exp(known - top) / np.sum(np.exp(known - top))
+    noise = np.max(covariance_at(problem.prepared.system, probes, problem.interval.start, problem.prepared.theta.real))
+    quick = min(problem.quick, DIFFUSED * float(p @ (probes - p @ probes) ** 2) / max(float(noise), 1e-300))
+    problem = problem._replace(message=lambda x: np.exp(logs(x) - top), probes=probes, quick=quick)
+    result = settled(problem, SMOOTH)
     return None if result is None else result._replace(log_scale=result.log_scale + top)
 
 
@@ -370,6 +398,16 @@ def _defined(prepared: Prepared, inner: float, outer: float, t: float) -> float:
 
 KINK_PROBES = 1025  # points between which kinks are sought
 ONE_KINK = 1e-10  # distance, of the interval, of the kinks of two coefficients that are one
+
+
+def kinks_of(prepared: Prepared, lower: float, upper: float, t: float) -> Array:
+    """Return the kinks between two states, of those that are known between ends out of few."""
+    if prepared.system.kinks is None:
+        return np.zeros(0)
+    unit, t = 2.0 ** np.ceil(np.log2(upper - lower)), t if prepared.system.varying else prepared.model.start
+    low, high = float(unit * np.floor(lower / unit)), float(unit * np.ceil(upper / unit))
+    known: Array = prepared.once(Derived.KINKS, (low, high, t), lambda: kinks_between(prepared, low, high, t))
+    return known[(known > lower) & (known < upper)]
 
 
 def kinks_between(prepared: Prepared, lower: float, upper: float, t: float) -> Array:
