@@ -209,7 +209,7 @@ def _solved(problem: Problem, element: Element, ratio: float, least: int = 1) ->
     def size(v: Array) -> Number:
         return np.max(v.real) if backward else np.sum(mass * v)
 
-    gained = np.log(size(v)) if backward else 0.0 * size(v)
+    gained = np.log(size(v) if backward else size(v) / size(v).real)
     v = v / size(v)
     ends = _ends_of_steps(problem, ratio) if ratio else np.linspace(0.0, problem.interval.length, least + 1)
     steps, part, factors = list(zip(ends[:-1], ends[1:], strict=True)), (0.0, 0.0), None
@@ -284,9 +284,8 @@ def _ended(problem: Problem, element: Element, ratio: float, limit: float) -> So
         if coarse.any() and not any(masses[[0, -1]][list(sides)] > MUCH * np.sum(masses)):
             element = element.bisected(coarse)
         else:
-            left, right = 4.0 * element.halves[[0, -1]] * sides
-            ends = element.lower, *element.cuts, element.upper
-            element = panels_between(problem.prepared, element.lower - left, element.upper + right, problem.interval.start, ends)
+            more = 4.0 * element.halves[[0, -1]] * sides
+            element = _around(problem, more, (element.lower, *element.cuts, element.upper))
     return solution
 
 
@@ -300,20 +299,26 @@ def _reached(problem: Problem, solution: Solution) -> tuple[bool, bool]:
 
 def panels_between(prepared: Prepared, low: float, high: float, t: float, cuts: tuple[float, ...] = ()) -> Element:
     """Return panels between two states in the domain, with ends at kinks, at `cuts`, or else of equal length."""
-    middle, more = 0.5 * (low + high), np.array(cuts) if cuts else np.linspace(low, high, FIRST_PANELS + 1)
+    more = np.array(cuts) if cuts else np.linspace(low, high, FIRST_PANELS + 1)
     low, high = np.clip([low, high], *domain_of(prepared)).tolist()
-    low, high = (_defined(prepared, middle, end, t) for end in (low, high))
     ends, apart = np.array([low, *kinks_of(prepared, low, high, t), high]), APART * (high - low)
     more = more[np.min(np.abs(more[:, None] - ends), axis=1) > apart]
     ends = np.sort(np.append(ends[(ends > low + apart) & (ends < high - apart)], more[(more > low) & (more < high)]))
     return Element(low, high, SIZES[0], tuple(ends.tolist()))
 
 
+def _around(problem: Problem, more: Array, ends: tuple[float, ...]) -> Element:
+    """Return panels with some ends, and by so much `more` (2,) on each side as the coefficients have values."""
+    middle, start = 0.5 * (ends[0] + ends[-1]), problem.interval.start
+    low, high = np.clip([ends[0] - more[0], ends[-1] + more[1]], *domain_of(problem.prepared)).tolist()
+    low, high = (_defined(problem.prepared, middle, end, start) for end in (low, high))
+    return panels_between(problem.prepared, low, high, start, ends)
+
+
 def settled(problem: Problem, allowed: float) -> Solution | None:
     """Return the function after the interval on more panels until two solutions differ by less than allowed, or by the least."""
     first, best = np.linspace(problem.low, problem.high, FIRST_PANELS + 1), None
-    reach = problem.reach * np.array([-1.0, 1.0])
-    element = panels_between(problem.prepared, *(first[[0, -1]] + reach), problem.interval.start, tuple(first.tolist()))
+    element = _around(problem, np.full(2, problem.reach), tuple(first.tolist()))
     for ratio in (0.0, RATIO)[problem.prepared.system.varying :]:
         limit, before = TAIL * allowed, np.inf
         if problem.backward:
@@ -330,6 +335,8 @@ def settled(problem: Problem, allowed: float) -> Solution | None:
                 break
             parts, element = _differences(problem, first, second), first.element
             error = float(np.sum(parts))
+            if not (problem.backward or problem.interval.inside.any()):
+                error += abs(float(second.log_scale.real))  # the mass stays, but for rounding
             if best is None or error < best.error:
                 best = second._replace(error=error)
             if error < allowed:

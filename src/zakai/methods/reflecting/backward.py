@@ -139,11 +139,12 @@ class _Product(NamedTuple):
 
 def _product(prepared: Prepared, state: State, message: Message) -> _Product:
     element, values = state.element, np.asarray(state.values).real
-    floor = SURE_OF_DENSITY * (NOISE + element.unresolved(values)) * np.max(values / element.weights)
+    known = values / element.weights
+    floor = SURE_OF_DENSITY * (NOISE * np.max(known) + element.tails(known))
 
     def logs(x: Array) -> Array:
         density = element.at(values, x)
-        return np.where(density > floor, logarithm(density), -np.inf) + message.at(x - message.origin)
+        return np.where(density > floor[element.panel(x)], logarithm(density), -np.inf) + message.at(x - message.origin)
 
     lower, upper = placed(logs, element.lower, element.upper, domain_of(prepared))
     lower, upper = max(lower, element.lower), min(upper, element.upper)

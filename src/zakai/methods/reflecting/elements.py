@@ -67,13 +67,17 @@ def sampled(
     element = panels_between(prepared, lower, upper, prepared.model.start)._replace(size=SIZES[1])
     for _ in range(ROUNDS):
         values = probabilities(element)
-        density = (values / element.weights).real
-        # A jump below the negligible does not fall in the sense of the maximum.
-        coarse = element.tails(density) * element.halves > negligible * float(np.max(np.abs(density))) * (upper - lower)
-        if not coarse.any() or len(coarse) > MOST_PANELS:
+        where = coarse(values, element, negligible)
+        if not where.any() or len(where) > MOST_PANELS:
             break
-        element = element.bisected(coarse)
+        element = element.bisected(where)
     return element, probabilities(element)
+
+
+def coarse(values: Array, element: Element, negligible: float) -> Array:
+    """Return which panels (P,) do not resolve a density, by what they leave in the mean over all: small jumps do not count."""
+    density = (values / element.weights).real
+    return element.tails(density) * element.halves > negligible * float(np.max(np.abs(density))) * (element.upper - element.lower)
 
 
 def reached(values: Array, element: Element, domain: Interval) -> tuple[float, float]:

@@ -21,6 +21,7 @@ from zakai.methods.line.report import Report
 from zakai.methods.line.update import error_remainder, factor_at_end, outside_tables, spread
 from zakai.methods.reflecting.elements import (
     SAMPLES,
+    coarse,
     domain_of,
     logarithm,
     moments,
@@ -125,7 +126,7 @@ def _multiplied(
         return normalized(density, without_nan(likelihood.logs(points.points)), points.weights, largest)
 
     new, (result, gained, depth, growth) = element, product(element)
-    if not new.unresolved(result) < negligible or _narrow(result, new):
+    if coarse(result, new, negligible).any() or _narrow(result, new):
         logs = logarithm((values / element.weights).real)
         ends = place(element.offsets, np.maximum(logs, np.max(logs) - DEPTH_OF_PRODUCT), likelihood, element.lower)
         if ends is not None:
