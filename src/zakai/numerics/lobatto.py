@@ -201,9 +201,8 @@ class Element(NamedTuple):
         return self._replace(cuts=tuple(np.sort(np.concatenate([ends[1:-1], middles])).tolist()))
 
     def unresolved(self, values: Array) -> float:
-        """Return the largest Legendre coefficient in the highest eighth, relative to the largest of all."""
-        coefficients = np.abs((values / self.weights).real.reshape(-1, self.size) @ rule(self.size).analysis.T)
-        return float(coefficients[:, -max(3, self.size // 8) :].max() / coefficients.max())
+        """Return the largest share of the mass that an interval leaves unresolved."""
+        return float(np.max(2.0 * self.halves * self.tails((values / self.weights).real)) / np.sum(np.abs(values.real)))
 
 
 @lru_cache(maxsize=256)
