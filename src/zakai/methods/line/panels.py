@@ -23,7 +23,7 @@ from zakai.methods.line.transition import Prediction
 from zakai.numerics.arrays import Array, Number
 from zakai.numerics.line import window as lw
 from zakai.numerics.line.averages import GAUSS_NODES, Panels, interpolation
-from zakai.numerics.line.rational import COLLOCATION, CONTRACTION, Factors, collocated, joined, separated, weak_form
+from zakai.numerics.line.rational import COLLOCATION, CONTRACTION, Factors, collocated, joined, masses, separated, weak_form
 from zakai.numerics.line.resolution import RESOLVED, ROUNDING, SUPPORT, TRANSITION_SHARE
 from zakai.numerics.lobatto import Element
 
@@ -136,7 +136,7 @@ class Solution(NamedTuple):
 
 
 class Operator:
-    """The operator on panels: M, r, and h B."""
+    """The operator A on panels, and its M and r at the ends of steps."""
 
     def __init__(self, problem: Problem, element: Element) -> None:
         self.problem, self.element, self.offset = problem, element, 0.0
@@ -145,17 +145,12 @@ class Operator:
         centre, reach = 0.5 * (problem.low + problem.high), 0.5 * (problem.high - problem.low)
         rate = FASTEST / (length * prepared.tolerance)
         self.fastest = rate * np.maximum(np.abs(element.points - centre), reach)
-        G, f, V = self.at(np.array([start]))
+        self.begin = self._at(np.array([start]))
         if inside.any():
-            self.offset = float(np.max(V[0].real[self.before.real > 1e-6 * self.before.real.max()]))
-        self.begin = G, f, V - self.offset
-        ends = G[0].reshape(-1, element.size)
-        left, right = ends[:-1, -1], ends[1:, 0]
-        ratios = np.where(right.real > 0.0, left, 1.0) / np.where(right.real > 0.0, right, 1.0)
-        self.scale = np.append(1.0, np.cumprod(np.where(np.abs(ratios - 1.0) > JUMP, ratios, 1.0)))
-        self.masses = element.weights * np.repeat(self.scale, element.size)
+            V = self.begin[2][0].real
+            self.offset = float(np.max(V[self.before.real > 1e-6 * self.before.real.max()]))
 
-    def at(self, times: Array) -> tuple[Array, Array, Array]:
+    def _at(self, times: Array) -> tuple[Array, Array, Array]:
         """Return G, f and V (T, N) at times."""
         problem = self.problem
         drift, covariance, potential, constant = coefficients(
@@ -163,23 +158,38 @@ class Operator:
         )
         drift = np.where(np.abs(drift) < self.fastest, drift, self.fastest * np.sign(drift.real))
         covariance = covariance if covariance.ndim == 2 else covariance[:, None]
-        return np.broadcast_to(covariance, drift.shape), drift, potential + constant[:, None] - self.offset
+        return np.broadcast_to(covariance, drift.shape), drift, potential + constant[:, None]
 
     def part(self, low: float, high: float) -> Callable[[Array, float], Array]:
-        """Return the function that gives h B at times after the start (T, P, n, n), within a part of the interval.
+        """Return the function that gives the parts of A, times a step, at times after the start (T, P, n, n).
 
-        Where no coefficient depends on time it gives one.
+        The times are in a part of the interval.  Where no coefficient depends on time it gives one.
         """
         varying, start = self.problem.prepared.system.varying, self.problem.interval.start
         times = within(start + low + (high - low) * GAUSS_NODES, start + low, start + high)
-        coefficients = self.at(times) if varying else self.begin
+        known = self._at(times) if varying else self.begin
 
         def blocks(times: Array, step: float) -> Array:
-            weights = step * (interpolation((times - low) / (high - low)) if varying else np.ones((1, 1)))
-            result = np.stack([weak_form(self.element, *(w @ one for one in coefficients), self.scale) for w in weights])
+            weights = interpolation((times - low) / (high - low)) if varying else np.ones((1, 1))
+            coefficients = zip(*(weights @ one for one in known), strict=True)
+            result = step * np.stack([weak_form(self.element, G, f, V - self.offset, self._scale(G)) for G, f, V in coefficients])
             return result.swapaxes(-1, -2) if self.problem.backward else result
 
         return blocks
+
+    def _scale(self, covariance: Array) -> Array:
+        """Return r (P,) for G (P n,)."""
+        ends = covariance.reshape(-1, self.element.size)
+        left, right = ends[:-1, -1], ends[1:, 0]
+        ratios = np.where(right.real > 0.0, left, 1.0) / np.where(right.real > 0.0, right, 1.0)
+        return np.append(1.0, np.cumprod(np.where(np.abs(ratios - 1.0) > JUMP, ratios, 1.0)))
+
+    def density(self, values: Array, t: float) -> Array:
+        """Return the density (..., P n) at a time after the start from the masses of points (..., P (n - 1) + 1)."""
+        start = self.problem.interval.start
+        G = self._at(within(np.array([start + t]), start, start + t))[0] if self.problem.prepared.system.varying else self.begin[0]
+        scale = self._scale(G[0])
+        return separated(self.element, values / masses(self.element, scale)) * np.repeat(scale, self.element.size)
 
 
 JUMP = 1e-5  # relative difference of G on both sides of a cut from which it is a jump
@@ -201,17 +211,16 @@ def _solved(problem: Problem, element: Element, ratio: float, least: int = 1) ->
         ratio: of the lengths of steps of collocation; zero for exponentials, where no coefficient depends on time.
         least: the number of exponentials.
     """
-    operator = Operator(problem, element)
-    masses, backward, quadrature = operator.masses, problem.backward, joined(element, element.weights)
-    mass, values = joined(element, masses), (problem.message or problem.density)(element.points)
-    v = joined(element, element.weights * values) / (quadrature if backward else mass)
+    operator, backward, length = Operator(problem, element), problem.backward, problem.interval.length
+    v = joined(element, element.weights * (problem.message or problem.density)(element.points))
+    v = v / joined(element, element.weights) if backward else v
 
     def size(v: Array) -> Number:
-        return np.max(v.real) if backward else np.sum(mass * v)
+        return np.max(v.real) if backward else np.sum(v)
 
     gained = np.log(size(v) if backward else size(v) / size(v).real)
     v = v / size(v)
-    ends = _ends_of_steps(problem, ratio) if ratio else np.linspace(0.0, problem.interval.length, least + 1)
+    ends = _ends_of_steps(problem, ratio) if ratio else np.linspace(0.0, length, least + 1)
     steps, part, factors = list(zip(ends[:-1], ends[1:], strict=True)), (0.0, 0.0), None
     steps = steps if backward else steps[::-1]
     while steps:
@@ -222,24 +231,23 @@ def _solved(problem: Problem, element: Element, ratio: float, least: int = 1) ->
             blocks = operator.part(*part)
         if ratio:
             at = last - step * COLLOCATION.nodes if backward else first + step * COLLOCATION.nodes
-            found = collocated(element, blocks(at, step), masses, v)
+            found = collocated(element, blocks(at, step), v)
             if found is None:
                 middle = 0.5 * (first + last)
-                if len(steps) > MOST_STEPS or step < LEAST_STEP * problem.interval.length:
+                if len(steps) > MOST_STEPS or step < LEAST_STEP * length:
                     return None
                 steps += [(first, middle), (middle, last)] if backward else [(middle, last), (first, middle)]
                 continue
             v = found
         else:
-            factors = factors or Factors.of(element, blocks(ends[:1], step)[0], masses, CONTRACTION.values)
+            factors = factors or Factors.of(element, blocks(ends[:1], step)[0], CONTRACTION.values)
             v = factors.exponential(v)
         scale = size(v)
         if not scale.real > 0.0:
             return None
         v, gained = v / scale, gained + np.log(scale)
-    u = separated(element, v)
-    u = u if backward else u * np.repeat(operator.scale, element.size)
-    return Solution(element, u, gained + operator.offset * problem.interval.length)
+    u = separated(element, v) if backward else operator.density(v, length)
+    return Solution(element, u, gained + operator.offset * length)
 
 
 def _unresolved(problem: Problem, element: Element, values: Array, after: bool) -> Array:

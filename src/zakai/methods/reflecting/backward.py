@@ -38,7 +38,7 @@ from zakai.numerics.arrays import Array
 from zakai.numerics.line import window as lw
 from zakai.numerics.line.backward import SMALLEST
 from zakai.numerics.line.density import support
-from zakai.numerics.line.rational import CONTRACTION, Factors, joined, separated
+from zakai.numerics.line.rational import CONTRACTION, Factors, separated
 from zakai.numerics.line.resolution import NOISE, SUPPORT
 from zakai.numerics.lobatto import Element
 
@@ -101,16 +101,14 @@ def _transition(prepared: Prepared, k: int, piece: Element, before: Array, obser
     """Return T (N, N) from the points of panels to the densities at them, weighted by what is observed inside."""
     interval = prepared.interval(k, prepared.inside[k], observed)
     problem = Problem.of(prepared, interval, piece, before * piece.weights, lambda x: before, np.array([piece.lower, piece.upper]))
-    operator = Operator(problem, piece)
-    result = np.diag(1.0 / joined(piece, operator.masses))
+    operator, result = Operator(problem, piece), np.eye(len(piece.points) - len(piece.cuts))
     for low, high in problem.parts.bounds:
         blocks, count = operator.part(low, high), SUBSTEPS if prepared.system.varying else 1
         step = (high - low) / count
         for first in np.linspace(low, high, count + 1)[:-1]:
             middle = np.array([first + 0.5 * step])
-            result = Factors.of(piece, blocks(middle, step)[0], operator.masses, CONTRACTION.values).exponential(result)
-    scale = np.repeat(operator.scale, piece.size)
-    return separated(piece, separated(piece, result).T) * scale[:, None]
+            result = Factors.of(piece, blocks(middle, step)[0], CONTRACTION.values).exponential(result)
+    return separated(piece, operator.density(result, interval.length).T)
 
 
 POINTS = 256  # of a message, on the whole element of the density

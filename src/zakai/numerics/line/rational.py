@@ -2,14 +2,14 @@
 
     u_t = (G u)'' / 2 - (f u)' + V u,      (G u)' / 2 - f u = 0 at the ends
 
-With u = r v, where v is continuous and the number r of each panel is such that r G is continuous, the weak form with the mass at
-the points is M v_t = B v,
+With u = r v, where v is continuous and the number r of each panel is such that r G is continuous, the weak form with lumped masses
+m = M v at the points is m_t = A m,
 
-    B = sum over panels r (D' W (f - D G / 2) + W V),      M = sum over panels r W,
+    A = sum over panels r (D' W (f - D G / 2) + W V) M^-1,      M = sum over panels r W.
 
-and exp(h M^-1 B) v is the sum over poles z of 2 Re c (h B - z M)^-1 M v.  The
-transposed B takes functions of the state backward.  The inner points of each panel are eliminated first (static condensation),
-for all panels and poles side by side; what is left is a tridiagonal system for the ends of the panels.
+The transposed A takes functions of the state backward.  A rational function of A with simple poles is a sum of (A - z)^-1.  The
+inner points of each panel are eliminated first (static condensation), for all panels and poles side by side; what is left is a
+tridiagonal system for the ends of the panels.
 """
 
 from __future__ import annotations
@@ -80,14 +80,18 @@ DIVERGED = 10.0  # the same, of one that does not converge
 
 
 def weak_form(element: Element, covariance: Array, drift: Array, potential: Array, scale: Array) -> Array:
-    """Return B (P, n, n) of panels for G, f and V at their points (P n,), and r (P,)."""
+    """Return the parts of A (P, n, n) of panels for G, f and V at their points (P n,), and r (P,)."""
     panels, own = (len(element.halves), 1, element.size), rule(element.size)
-    transport = own.derivative.T * own.weights
+    transport, inner = own.derivative.T * own.weights, np.arange(element.size)
     G, f, V = (np.reshape(part, panels) for part in (covariance, drift, potential))
     result = transport * f - (transport @ own.derivative) * (0.5 * G / element.halves[:, None, None])
-    inner = np.arange(element.size)
     result[:, inner, inner] += element.halves[:, None] * own.weights * V[:, 0]
-    return np.asarray(result * scale[:, None, None])
+    return np.asarray(result * scale[:, None, None] / separated(element, masses(element, scale)).reshape(panels))
+
+
+def masses(element: Element, scale: Array) -> Array:
+    """Return M (P (n - 1) + 1,) for r (P,)."""
+    return joined(element, element.weights * np.repeat(scale, element.size))
 
 
 def joined(element: Element, values: Array) -> Array:
@@ -108,7 +112,7 @@ def separated(element: Element, values: Array) -> Array:
 
 
 class Factors(NamedTuple):
-    """The factors of h B - z M for each pole, h B and M at the points of the panels.
+    """The factors of A - z for each pole.
 
     `inner` (2, C, n, n, LANES) are the real and imaginary parts of those of panels, `ends` (K, P + 1, 3) of the ends of panels.
     """
@@ -117,49 +121,43 @@ class Factors(NamedTuple):
     inner: Array
     ends: Array
     blocks: Array
-    masses: Array
 
     @classmethod
-    def of(cls, element: Element, blocks: Array, masses: Array, poles: Array) -> Factors:
-        """Return the factors for h B (P, n, n), M (P n,) and poles (K,)."""
-        real = np.ascontiguousarray(masses.real).reshape(blocks.shape[:2])
-        return cls(element, *_factors(np.ascontiguousarray(blocks.real), real, poles), blocks, masses)
+    def of(cls, element: Element, blocks: Array, poles: Array) -> Factors:
+        """Return the factors for the parts of A (P, n, n) and poles (K,)."""
+        return cls(element, *_factors(np.ascontiguousarray(blocks.real), poles), blocks)
 
     def exponential(self, values: Array) -> Array:
-        """Return exp(h M^-1 B) v for v (..., P (n - 1) + 1) and the poles of contraction; complex arguments carry derivatives."""
-        element, (poles, residues) = self.element, CONTRACTION
-        right = joined(element, self.masses) * values
-        x = _solutions(self.inner, self.ends, right.real.reshape(-1, 1, right.shape[-1]).astype(complex))
-        result = 2.0 * np.einsum("k,rkj->rj", residues, x).real.reshape(values.shape)
-        if any(map(np.iscomplexobj, (self.blocks, self.masses, values))):  # of one v
-            moved = applied(element, self.blocks.imag, x[0]) - poles[:, None] * joined(element, self.masses.imag) * x[0]
-            change = right.imag - moved
-            result = result + 2.0j * (residues @ _solutions(self.inner, self.ends, change[None])[0]).real
+        """Return exp(A) m for m (..., P (n - 1) + 1) and the poles of contraction; complex arguments carry derivatives."""
+        x = _solutions(self.inner, self.ends, values.real.reshape(-1, 1, values.shape[-1]).astype(complex))
+        result = 2.0 * np.einsum("k,rkj->rj", CONTRACTION.residues, x).real.reshape(values.shape)
+        if np.iscomplexobj(self.blocks) or np.iscomplexobj(values):  # of one m
+            change = values.imag - applied(self.element, self.blocks.imag, x[0])
+            result = result + 2.0j * (CONTRACTION.residues @ _solutions(self.inner, self.ends, change[None])[0]).real
         return np.asarray(result)
 
 
 def applied(element: Element, blocks: Array, values: Array) -> Array:
-    """Return B v for B (..., P, n, n) of panels and v (..., P (n - 1) + 1)."""
+    """Return A m for the parts of A (..., P, n, n) of panels and m (..., P (n - 1) + 1)."""
     at = separated(element, values)
     return joined(element, (blocks @ at.reshape(*at.shape[:-1], -1, element.size, 1)).reshape(at.shape))
 
 
-def collocated(element: Element, blocks: Array, masses: Array, values: Array) -> Array | None:
-    """Return v after a step with operators that depend on time, None where the iteration with their mean does not converge.
+def collocated(element: Element, blocks: Array, values: Array) -> Array | None:
+    """Return m after a step with an A that depends on time, None where the iteration with its mean does not converge.
 
     Complex arguments carry derivatives.
 
     Args:
         element: the panels.
-        blocks: h B at the nodes of `COLLOCATION` (6, P, n, n), or one (1, P, n, n) that holds at all.
-        masses: M at the points of the panels (P n,).
-        values: v (P (n - 1) + 1,).
+        blocks: the parts of A, times the step, at the nodes of `COLLOCATION` (6, P, n, n), or one (1, P, n, n) that holds at all.
+        values: m (P (n - 1) + 1,).
     """
-    rule, mass, mean = COLLOCATION, joined(element, masses), np.mean(blocks.real, axis=0)
-    factors, changes = Factors.of(element, mean, masses.real, rule.poles), blocks - mean
-    carries = any(map(np.iscomplexobj, (blocks, masses, values)))
-    begin = np.tile(mass * values, (len(rule.nodes), 1))
-    stages, right = np.tile(values, (len(rule.nodes), 1)), begin
+    rule, mean = COLLOCATION, np.mean(blocks.real, axis=0)
+    factors, changes = Factors.of(element, mean, rule.poles), blocks - mean
+    carries = np.iscomplexobj(blocks) or np.iscomplexobj(values)
+    begin = np.tile(values, (len(rule.nodes), 1))
+    stages, right = begin, begin
     for _ in range(ITERATIONS):
         parts = np.stack([right.real, right.imag]) if carries else right[None]
         solved = _solutions(factors.inner, factors.ends, -rule.poles[:, None] * (rule.inverse @ parts))
@@ -168,11 +166,10 @@ def collocated(element: Element, blocks: Array, masses: Array, values: Array) ->
         change = max(_relative((new - stages).real, new.real), _relative((new - stages).imag, new.imag) if carries else 0.0)
         stages = new
         if change < ITERATED or (len(blocks) == 1 and not carries):
-            return stages[-1]
+            return np.asarray(stages[-1])
         if not change < DIVERGED:
             return None
         right = begin + rule.integrals @ applied(element, changes, stages)
-        right = right - 1j * mass.imag * (stages - values) if carries else right
     return None
 
 
@@ -183,13 +180,14 @@ def _relative(change: Array, values: Array) -> float:
 _FACTORS = types.Tuple((float64[:, :, :, :, ::1], complex128[:, :, ::1]))  # type: ignore[no-untyped-call]
 
 
-@kernel(_FACTORS(float64[:, :, ::1], float64[:, ::1], complex128[::1]))
-def _factors(blocks: Array, masses: Array, poles: Array) -> tuple[Array, Array]:
+@kernel(_FACTORS(float64[:, :, ::1], complex128[::1]))
+def _factors(blocks: Array, poles: Array) -> tuple[Array, Array]:
     """Return the factors of all panels and poles, whose points are in the order inner ones, first, last; and of the ends."""
-    P, n = masses.shape
+    P, n = blocks.shape[:2]
     K, total = poles.size, P * poles.size
     chunks = (total + LANES - 1) // LANES
     inner, ends = np.empty((2, chunks, n, n, LANES)), np.zeros((K, P + 1, 3), np.complex128)
+    ends[:, :, 1] -= poles.reshape(-1, 1)
     order = np.append(np.arange(1, n - 1), np.array([0, n - 1]))
     for c in range(chunks):
         re, im = inner[0, c], inner[1, c]
@@ -199,8 +197,9 @@ def _factors(blocks: Array, masses: Array, poles: Array) -> tuple[Array, Array]:
             for a in range(n):
                 for b in range(n):
                     re[a, b, lane], im[a, b, lane] = blocks[q, order[a], order[b]], 0.0
-                re[a, a, lane] -= poles[k].real * masses[q, order[a]]
-                im[a, a, lane] = -poles[k].imag * masses[q, order[a]]
+            for a in range(n - 2):
+                re[a, a, lane] -= poles[k].real
+                im[a, a, lane] = -poles[k].imag
         for k in range(n - 2):
             for lane in range(LANES):
                 inverse = 1.0 / (re[k, k, lane] * re[k, k, lane] + im[k, k, lane] * im[k, k, lane])
