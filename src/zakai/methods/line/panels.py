@@ -40,8 +40,8 @@ ROUNDS = 40  # of bisection
 MOST_PANELS = 1000
 EDGE = 1e-9  # density at the ends of panels, relative to the maximum, beyond which they are too few
 MUCH = 1e-3  # probability of an outermost panel beyond which the panels are too few before they are too long
-FASTEST = 100.0  # rate at which the drift contracts, times the length of the interval and the tolerance, that no faster one exceeds
-RATIO, FINER = 2.0, 1.2  # of the lengths of steps in time
+FASTEST = 100.0  # largest rate at which the drift contracts, times the length of the interval and the tolerance
+RATIO, FINER = 4.0, 1.2  # of the lengths of steps in time
 FIRST = 0.1  # of the time in which the drift would cross the range of the density, and of the interval: the first step
 REACH = 7.0  # standard deviations of the noise beyond the density before, between which the first panels lie
 DIFFUSED = 0.5  # of the time in which noise would double the variance: the first step
@@ -53,8 +53,9 @@ SETTLED = 1e-2  # error above which panels do not serve
 class Problem(NamedTuple):
     """What an interval does to the density before it, or to a `message`, what a state is worth at the end, backward.
 
-    Both are functions of states (J,), smooth between `probes`.  The density before lies between `low` and `high`, and `after` is the
-    one after the interval.  The coefficients are polynomials of time in each of the `parts`; the first step in time is `quick`.
+    Both are functions of states (J,), smooth between `probes`.  The density before lies between `low` and `high`, noise carries
+    it by `reach` beyond, and `after` is the one after the interval.  The coefficients are polynomials of time in each of the
+    `parts`; the first step in time is `quick`.
     """
 
     prepared: Prepared
@@ -171,32 +172,34 @@ class Operator:
 
         def blocks(times: Array, step: float) -> Array:
             weights = interpolation((times - low) / (high - low)) if varying else np.ones((1, 1))
-            coefficients = zip(*(weights @ one for one in known), strict=True)
-            result = step * np.stack([weak_form(self.element, G, f, V - self.offset, self._scale(G)) for G, f, V in coefficients])
+            G, f, V = (weights @ one for one in known)
+            result = step * weak_form(self.element, G, f, V - self.offset, self._scale(G))
             return result.swapaxes(-1, -2) if self.problem.backward else result
 
         return blocks
 
     def _scale(self, covariance: Array) -> Array:
-        """Return r (P,) for G (P n,)."""
-        ends = covariance.reshape(-1, self.element.size)
-        left, right = ends[:-1, -1], ends[1:, 0]
-        ratios = np.where(right.real > 0.0, left, 1.0) / np.where(right.real > 0.0, right, 1.0)
-        return np.append(1.0, np.cumprod(np.where(np.abs(ratios - 1.0) > JUMP, ratios, 1.0)))
+        """Return r (..., P) for G (..., P n)."""
+        left, right = covariance[..., :: self.element.size], covariance[..., self.element.size - 1 :: self.element.size]
+        ratios = np.ones_like(left)
+        known = right.real[..., :-1] * left.real[..., 1:] > 0.0
+        np.divide(right[..., :-1], left[..., 1:], out=ratios[..., 1:], where=known)
+        return np.asarray(np.cumprod(np.where(np.abs(ratios - 1.0) > JUMP, ratios, 1.0), axis=-1))
 
     def density(self, values: Array, t: float) -> Array:
         """Return the density (..., P n) at a time after the start from the masses of points (..., P (n - 1) + 1)."""
         start = self.problem.interval.start
-        G = self._at(within(np.array([start + t]), start, start + t))[0] if self.problem.prepared.system.varying else self.begin[0]
+        varying = self.problem.prepared.system.varying
+        G, _, _ = self._at(within(np.array([start + t]), start, start + t)) if varying else self.begin
         scale = self._scale(G[0])
-        return separated(self.element, values / masses(self.element, scale)) * np.repeat(scale, self.element.size)
+        return np.asarray(separated(self.element, values / masses(self.element, scale)) * np.repeat(scale, self.element.size))
 
 
 JUMP = 1e-5  # relative difference of G on both sides of a cut from which it is a jump
 
 
 def _ends_of_steps(problem: Problem, ratio: float) -> Array:
-    """Return the ends (T + 1,) of steps between the parts, longer than the one before by at most a ratio, backward at both ends."""
+    """Return the ends (T + 1,) of steps, longer than the one before by at most a ratio, backward also at the end."""
     length = problem.interval.length
     count = int(np.ceil(np.log(length / problem.quick) / np.log(ratio)))
     ends = length * (problem.quick / length) ** np.linspace(1.0, 0.0, count + 1)
@@ -216,7 +219,8 @@ def _solved(problem: Problem, element: Element, ratio: float, least: int = 1) ->
     v = v / joined(element, element.weights) if backward else v
 
     def size(v: Array) -> Number:
-        return np.max(v.real) if backward else np.sum(v)
+        result: Number = np.max(v.real) if backward else np.sum(v)
+        return result
 
     gained = np.log(size(v) if backward else size(v) / size(v).real)
     v = v / size(v)
@@ -325,8 +329,8 @@ def _around(problem: Problem, more: Array, ends: tuple[float, ...]) -> Element:
 
 def settled(problem: Problem, allowed: float) -> Solution | None:
     """Return the function after the interval on more panels until two solutions differ by less than allowed, or by the least."""
-    first, best = np.linspace(problem.low, problem.high, FIRST_PANELS + 1), None
-    element = _around(problem, np.full(2, problem.reach), tuple(first.tolist()))
+    ends = tuple(np.linspace(problem.low, problem.high, FIRST_PANELS + 1).tolist())
+    element, best = _around(problem, np.full(2, problem.reach), ends), None
     for ratio in (0.0, RATIO)[problem.prepared.system.varying :]:
         limit, before = TAIL * allowed, np.inf
         if problem.backward:

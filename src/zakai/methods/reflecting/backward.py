@@ -100,7 +100,8 @@ def _drawn(prepared: Prepared, k: int, piece: Element, z: Array, observed: np.nd
 def _transition(prepared: Prepared, k: int, piece: Element, before: Array, observed: np.ndarray) -> Array:
     """Return T (N, N) from the points of panels to the densities at them, weighted by what is observed inside."""
     interval = prepared.interval(k, prepared.inside[k], observed)
-    problem = Problem.of(prepared, interval, piece, before * piece.weights, lambda x: before, np.array([piece.lower, piece.upper]))
+    ends = np.array([piece.lower, piece.upper])
+    problem = Problem.of(prepared, interval, piece, before * piece.weights, lambda x: before, ends)
     operator, result = Operator(problem, piece), np.eye(len(piece.points) - len(piece.cuts))
     for low, high in problem.parts.bounds:
         blocks, count = operator.part(low, high), SUBSTEPS if prepared.system.varying else 1

@@ -2,8 +2,8 @@
 
     u_t = (G u)'' / 2 - (f u)' + V u,      (G u)' / 2 - f u = 0 at the ends
 
-With u = r v, where v is continuous and the number r of each panel is such that r G is continuous, the weak form with lumped masses
-m = M v at the points is m_t = A m,
+With u = r v, where v is continuous and the number r of each panel is such that r G is continuous, the weak form with lumped
+masses m = M v at the points is m_t = A m,
 
     A = sum over panels r (D' W (f - D G / 2) + W V) M^-1,      M = sum over panels r W.
 
@@ -53,7 +53,7 @@ class Collocation(NamedTuple):
     """Radau IIA collocation of order 11 (Hairer and Wanner, Solving Ordinary Differential Equations II, section IV.5).
 
     Its six `nodes` in [0, 1] end with one, `integrals` (6, 6) are the Runge-Kutta matrix.  The eigenvalues of that above the real
-    axis are one over the `poles` (3,), with eigenvectors `vectors` (6, 3) and rows `inverse` (3, 6) of the inverse of all vectors.
+    axis are one over the `poles` (3,), with eigenvectors `vectors` (6, 3) and the rows `inverse` (3, 6) of their inverse.
     """
 
     nodes: Array
@@ -80,18 +80,18 @@ DIVERGED = 10.0  # the same, of one that does not converge
 
 
 def weak_form(element: Element, covariance: Array, drift: Array, potential: Array, scale: Array) -> Array:
-    """Return the parts of A (P, n, n) of panels for G, f and V at their points (P n,), and r (P,)."""
-    panels, own = (len(element.halves), 1, element.size), rule(element.size)
-    transport, inner = own.derivative.T * own.weights, np.arange(element.size)
-    G, f, V = (np.reshape(part, panels) for part in (covariance, drift, potential))
-    result = transport * f - (transport @ own.derivative) * (0.5 * G / element.halves[:, None, None])
-    result[:, inner, inner] += element.halves[:, None] * own.weights * V[:, 0]
-    return np.asarray(result * scale[:, None, None] / separated(element, masses(element, scale)).reshape(panels))
+    """Return the parts of A (..., P, n, n) of panels for G, f and V at their points (..., P n), and r (..., P)."""
+    own, inner = rule(element.size), np.arange(element.size)
+    transport, shape = own.derivative.T * own.weights, (*drift.shape[:-1], len(element.halves), 1, element.size)
+    noise = 0.5 * covariance.reshape(shape) / element.halves[:, None, None]
+    result = transport * drift.reshape(shape) - (transport @ own.derivative) * noise
+    result[..., inner, inner] += (element.weights * potential).reshape(shape)[..., 0, :]
+    return result * (scale[..., None, None] / separated(element, masses(element, scale)).reshape(shape))
 
 
 def masses(element: Element, scale: Array) -> Array:
-    """Return M (P (n - 1) + 1,) for r (P,)."""
-    return joined(element, element.weights * np.repeat(scale, element.size))
+    """Return M (..., P (n - 1) + 1) for r (..., P)."""
+    return joined(element, element.weights * np.repeat(scale, element.size, axis=-1))
 
 
 def joined(element: Element, values: Array) -> Array:
