@@ -100,6 +100,12 @@ def on_the_line(model: Model) -> Model:
     return other
 
 
+def reflecting_ends(prepared: Prepared) -> tuple[float, float]:
+    """Return the ends of the domain where these reflect, else infinite ones."""
+    domain = prepared.model.domain.get(prepared.model.state[0], Interval())
+    return (domain.lower, domain.upper) if prepared.system.reflecting else (-np.inf, np.inf)
+
+
 NEAR_END = 1e-9  # distance from an end other than zero, relative to it and to the length of the domain
 NEAR_ZERO = 1e-40  # distance from zero, near which numbers have no rounding of their own
 RATIO_OF_DISTANCES = 1e3  # ratio of the two distances that show a power

@@ -15,7 +15,7 @@ import numpy as np
 
 from zakai.methods.line.cache import Derived
 from zakai.methods.line.coefficients import coefficients, covariance_at, resolved_parts
-from zakai.methods.line.domain import ends_of_leak
+from zakai.methods.line.domain import ends_of_leak, reflecting_ends
 from zakai.methods.line.model import MOST_KINKS, finite, within
 from zakai.methods.line.prepared import Prepared, TimeInterval
 from zakai.methods.line.report import Report
@@ -37,7 +37,7 @@ LEVELS = 3  # pairs of solutions that are compared
 GROSS = 1e-2  # share of the function that a panel leaves unresolved, which shows in all others
 WORST = 0.03  # of the worst panel: what others leave unresolved that are bisected with it
 ROUNDS = 40  # of bisection
-MOST_PANELS = 1000
+MOST_PANELS = 500  # beyond which none is bisected
 EDGE = 1e-9  # density at the ends of panels, relative to the maximum, beyond which they are too few
 MUCH = 1e-3  # probability of an outermost panel beyond which the panels are too few before they are too long
 FASTEST = 100.0  # largest rate at which the drift contracts, times the length of the interval and the tolerance
@@ -304,7 +304,7 @@ def _ended(problem: Problem, element: Element, ratio: float, limit: float) -> So
 def _reached(problem: Problem, solution: Solution) -> tuple[bool, bool]:
     """Return whether a density reaches the ends of its panels, beyond which there may be more of it."""
     density, element = np.abs(solution.values.real), solution.element
-    low, high = domain_of(problem.prepared)
+    low, high = reflecting_ends(problem.prepared)
     left, right = density[[0, -1]] > EDGE * np.max(density)
     return bool(left and element.lower > low), bool(right and element.upper < high)
 
@@ -312,7 +312,7 @@ def _reached(problem: Problem, solution: Solution) -> tuple[bool, bool]:
 def panels_between(prepared: Prepared, low: float, high: float, t: float, cuts: tuple[float, ...] = ()) -> Element:
     """Return panels between two states in the domain, with ends at kinks, at `cuts`, or else of equal length."""
     more = np.array(cuts) if cuts else np.linspace(low, high, FIRST_PANELS + 1)
-    low, high = np.clip([low, high], *domain_of(prepared)).tolist()
+    low, high = np.clip([low, high], *reflecting_ends(prepared)).tolist()
     ends, apart = np.array([low, *kinks_of(prepared, low, high, t), high]), APART * (high - low)
     more = more[np.min(np.abs(more[:, None] - ends), axis=1) > apart]
     ends = np.sort(np.append(ends[(ends > low + apart) & (ends < high - apart)], more[(more > low) & (more < high)]))
@@ -322,7 +322,7 @@ def panels_between(prepared: Prepared, low: float, high: float, t: float, cuts: 
 def _around(problem: Problem, more: Array, ends: tuple[float, ...]) -> Element:
     """Return panels with some ends, and by so much `more` (2,) on each side as the coefficients have values."""
     middle, start = 0.5 * (ends[0] + ends[-1]), problem.interval.start
-    low, high = np.clip([ends[0] - more[0], ends[-1] + more[1]], *domain_of(problem.prepared)).tolist()
+    low, high = np.clip([ends[0] - more[0], ends[-1] + more[1]], *reflecting_ends(problem.prepared)).tolist()
     low, high = (_defined(problem.prepared, middle, end, start) for end in (low, high))
     return panels_between(problem.prepared, low, high, start, ends)
 
@@ -358,6 +358,8 @@ def settled(problem: Problem, allowed: float) -> Solution | None:
             if ratio == RATIO:
                 ratio = FINER
                 continue
+            if len(parts) > MOST_PANELS:
+                break
             before, limit = error, TIGHTER * limit
             element = element.bisected(parts > 0.5 * allowed / len(parts))
     return best if best is not None and best.error < SETTLED else None
@@ -392,14 +394,6 @@ def pulled_back(problem: Problem, logs: Function, probes: Array) -> Solution | N
 
 APART = 1e-6  # of the range: ends of panels that are nearer to each other are one
 PROBES = 65  # points between which a formula ceases to have values
-
-
-def domain_of(prepared: Prepared) -> tuple[float, float]:
-    """Return the reflecting ends of the domain."""
-    if not prepared.system.reflecting:
-        return -np.inf, np.inf
-    domain = prepared.model.domain[prepared.model.state[0]]
-    return domain.lower, domain.upper
 
 
 def _defined(prepared: Prepared, inner: float, outer: float, t: float) -> float:
