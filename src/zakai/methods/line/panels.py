@@ -31,7 +31,7 @@ Function = Callable[[Array], Array]
 
 SIZES = 9, 13  # points of a panel of two solutions
 FIRST_PANELS = 8  # of equal length
-TAIL = 10.0  # allowed errors that a panel may leave unresolved: the error that remains after an interval is far smaller
+TAIL = 1.0  # allowed errors that a panel may leave unresolved in the coarser of two solutions
 TIGHTER = 0.03  # that where two solutions differ too much, relative to that before
 LEVELS = 3  # pairs of solutions that are compared
 GROSS = 1e-2  # share of the function that a panel leaves unresolved, which shows in all others

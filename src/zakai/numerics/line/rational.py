@@ -8,7 +8,7 @@ masses m = M v at the points is m_t = A m,
     A = sum over panels r (D' W (f - D G / 2) + W V) M^-1,      M = sum over panels r W.
 
 The transposed A takes functions of the state backward.  A rational function of A with simple poles is a sum of (A - z)^-1.  The
-inner points of each panel are eliminated first (static condensation), for all panels and poles side by side; what is left is a
+inner points of each panel are eliminated first (static condensation), for all panels and poles side by side; the rest is a
 tridiagonal system for the ends of the panels.
 """
 
@@ -23,7 +23,7 @@ from zakai.numerics.arrays import Array
 from zakai.numerics.compiled import kernel
 from zakai.numerics.lobatto import Element, rule
 
-LANES = 24  # systems that are eliminated side by side: they fit into the cache of a core
+BATCH = 24  # systems that are eliminated side by side: they fit into the cache of a core
 
 
 class Poles(NamedTuple):
@@ -114,7 +114,7 @@ def separated(element: Element, values: Array) -> Array:
 class Factors(NamedTuple):
     """The factors of A - z for each pole.
 
-    `inner` (2, C, n, n, LANES) are the real and imaginary parts of those of panels, `ends` (K, P + 1, 3) of the ends of panels.
+    `inner` (2, C, n, n, BATCH) are the real and imaginary parts of those of panels, `ends` (K, P + 1, 3) of the ends of panels.
     """
 
     element: Element
@@ -185,41 +185,41 @@ def _factors(blocks: Array, poles: Array) -> tuple[Array, Array]:
     """Return the factors of all panels and poles, whose points are in the order inner ones, first, last; and of the ends."""
     P, n = blocks.shape[:2]
     K, total = poles.size, P * poles.size
-    chunks = (total + LANES - 1) // LANES
-    inner, ends = np.empty((2, chunks, n, n, LANES)), np.zeros((K, P + 1, 3), np.complex128)
+    chunks = (total + BATCH - 1) // BATCH
+    inner, ends = np.empty((2, chunks, n, n, BATCH)), np.zeros((K, P + 1, 3), np.complex128)
     ends[:, :, 1] -= poles.reshape(-1, 1)
     order = np.append(np.arange(1, n - 1), np.array([0, n - 1]))
     for c in range(chunks):
         re, im = inner[0, c], inner[1, c]
-        for lane in range(LANES):
-            system = min(c * LANES + lane, total - 1)
+        for entry in range(BATCH):
+            system = min(c * BATCH + entry, total - 1)
             k, q = system // P, system % P
             for a in range(n):
                 for b in range(n):
-                    re[a, b, lane], im[a, b, lane] = blocks[q, order[a], order[b]], 0.0
+                    re[a, b, entry], im[a, b, entry] = blocks[q, order[a], order[b]], 0.0
             for a in range(n - 2):
-                re[a, a, lane] -= poles[k].real
-                im[a, a, lane] = -poles[k].imag
+                re[a, a, entry] -= poles[k].real
+                im[a, a, entry] = -poles[k].imag
         for k in range(n - 2):
-            for lane in range(LANES):
-                inverse = 1.0 / (re[k, k, lane] * re[k, k, lane] + im[k, k, lane] * im[k, k, lane])
-                re[k, k, lane], im[k, k, lane] = re[k, k, lane] * inverse, -im[k, k, lane] * inverse
+            for entry in range(BATCH):
+                inverse = 1.0 / (re[k, k, entry] * re[k, k, entry] + im[k, k, entry] * im[k, k, entry])
+                re[k, k, entry], im[k, k, entry] = re[k, k, entry] * inverse, -im[k, k, entry] * inverse
             for i in range(k + 1, n):
-                for lane in range(LANES):
-                    real = re[i, k, lane] * re[k, k, lane] - im[i, k, lane] * im[k, k, lane]
-                    im[i, k, lane] = re[i, k, lane] * im[k, k, lane] + im[i, k, lane] * re[k, k, lane]
-                    re[i, k, lane] = real
+                for entry in range(BATCH):
+                    real = re[i, k, entry] * re[k, k, entry] - im[i, k, entry] * im[k, k, entry]
+                    im[i, k, entry] = re[i, k, entry] * im[k, k, entry] + im[i, k, entry] * re[k, k, entry]
+                    re[i, k, entry] = real
                 for j in range(k + 1, n):
-                    for lane in range(LANES):
-                        re[i, j, lane] -= re[i, k, lane] * re[k, j, lane] - im[i, k, lane] * im[k, j, lane]
-                        im[i, j, lane] -= re[i, k, lane] * im[k, j, lane] + im[i, k, lane] * re[k, j, lane]
-        for lane in range(min(LANES, total - c * LANES)):
-            k, q = (c * LANES + lane) // P, (c * LANES + lane) % P
+                    for entry in range(BATCH):
+                        re[i, j, entry] -= re[i, k, entry] * re[k, j, entry] - im[i, k, entry] * im[k, j, entry]
+                        im[i, j, entry] -= re[i, k, entry] * im[k, j, entry] + im[i, k, entry] * re[k, j, entry]
+        for entry in range(min(BATCH, total - c * BATCH)):
+            k, q = (c * BATCH + entry) // P, (c * BATCH + entry) % P
             a, b = n - 2, n - 1
-            ends[k, q, 1] += complex(re[a, a, lane], im[a, a, lane])
-            ends[k, q, 2] += complex(re[a, b, lane], im[a, b, lane])
-            ends[k, q + 1, 0] += complex(re[b, a, lane], im[b, a, lane])
-            ends[k, q + 1, 1] += complex(re[b, b, lane], im[b, b, lane])
+            ends[k, q, 1] += complex(re[a, a, entry], im[a, a, entry])
+            ends[k, q, 2] += complex(re[a, b, entry], im[a, b, entry])
+            ends[k, q + 1, 0] += complex(re[b, a, entry], im[b, a, entry])
+            ends[k, q + 1, 1] += complex(re[b, b, entry], im[b, b, entry])
     for k in range(K):
         for q in range(1, P + 1):
             ends[k, q, 0] /= ends[k, q - 1, 1]
@@ -232,28 +232,28 @@ def _solutions(inner: Array, ends: Array, right: Array) -> Array:
     """Return x (R, K, N) for right-hand sides (R, K, N), or (R, 1, N) of all poles."""
     R, n, (K, P) = right.shape[0], inner.shape[2], (ends.shape[0], ends.shape[1] - 1)
     last, total = n - 1, P * K
-    x, y = np.zeros((R, K, P * last + 1), np.complex128), np.empty((2, inner.shape[1], n, LANES))
+    x, y = np.zeros((R, K, P * last + 1), np.complex128), np.empty((2, inner.shape[1], n, BATCH))
     for row in range(R):
         for c in range(inner.shape[1]):
             re, im, yr, yi = inner[0, c], inner[1, c], y[0, c], y[1, c]
-            for lane in range(LANES):
-                system = min(c * LANES + lane, total - 1)
+            for entry in range(BATCH):
+                system = min(c * BATCH + entry, total - 1)
                 k, q = system // P, system % P
                 own = right[row, min(k, right.shape[1] - 1)]
                 for a in range(n - 2):
-                    yr[a, lane], yi[a, lane] = own[q * last + a + 1].real, own[q * last + a + 1].imag
+                    yr[a, entry], yi[a, entry] = own[q * last + a + 1].real, own[q * last + a + 1].imag
                 first = own[0] if q == 0 else 0.0j  # the ends of panels count once
-                yr[n - 2, lane], yi[n - 2, lane] = first.real, first.imag
-                yr[n - 1, lane], yi[n - 1, lane] = own[(q + 1) * last].real, own[(q + 1) * last].imag
+                yr[n - 2, entry], yi[n - 2, entry] = first.real, first.imag
+                yr[n - 1, entry], yi[n - 1, entry] = own[(q + 1) * last].real, own[(q + 1) * last].imag
             for k in range(n - 2):
                 for i in range(k + 1, n):
-                    for lane in range(LANES):
-                        yr[i, lane] -= re[i, k, lane] * yr[k, lane] - im[i, k, lane] * yi[k, lane]
-                        yi[i, lane] -= re[i, k, lane] * yi[k, lane] + im[i, k, lane] * yr[k, lane]
-            for lane in range(min(LANES, total - c * LANES)):
-                k, q = (c * LANES + lane) // P, (c * LANES + lane) % P
-                x[row, k, q * last] += complex(yr[n - 2, lane], yi[n - 2, lane])
-                x[row, k, (q + 1) * last] += complex(yr[n - 1, lane], yi[n - 1, lane])
+                    for entry in range(BATCH):
+                        yr[i, entry] -= re[i, k, entry] * yr[k, entry] - im[i, k, entry] * yi[k, entry]
+                        yi[i, entry] -= re[i, k, entry] * yi[k, entry] + im[i, k, entry] * yr[k, entry]
+            for entry in range(min(BATCH, total - c * BATCH)):
+                k, q = (c * BATCH + entry) // P, (c * BATCH + entry) % P
+                x[row, k, q * last] += complex(yr[n - 2, entry], yi[n - 2, entry])
+                x[row, k, (q + 1) * last] += complex(yr[n - 1, entry], yi[n - 1, entry])
         for k in range(K):
             for q in range(1, P + 1):
                 x[row, k, q * last] -= ends[k, q, 0] * x[row, k, (q - 1) * last]
@@ -262,23 +262,23 @@ def _solutions(inner: Array, ends: Array, right: Array) -> Array:
                 x[row, k, q * last] = (x[row, k, q * last] - ends[k, q, 2] * x[row, k, (q + 1) * last]) / ends[k, q, 1]
         for c in range(inner.shape[1]):
             re, im, yr, yi = inner[0, c], inner[1, c], y[0, c], y[1, c]
-            for lane in range(LANES):
-                system = min(c * LANES + lane, total - 1)
+            for entry in range(BATCH):
+                system = min(c * BATCH + entry, total - 1)
                 k, q = system // P, system % P
                 left, other = x[row, k, q * last], x[row, k, (q + 1) * last]
-                yr[n - 2, lane], yi[n - 2, lane] = left.real, left.imag
-                yr[n - 1, lane], yi[n - 1, lane] = other.real, other.imag
+                yr[n - 2, entry], yi[n - 2, entry] = left.real, left.imag
+                yr[n - 1, entry], yi[n - 1, entry] = other.real, other.imag
             for i in range(n - 3, -1, -1):
                 for j in range(i + 1, n):
-                    for lane in range(LANES):
-                        yr[i, lane] -= re[i, j, lane] * yr[j, lane] - im[i, j, lane] * yi[j, lane]
-                        yi[i, lane] -= re[i, j, lane] * yi[j, lane] + im[i, j, lane] * yr[j, lane]
-                for lane in range(LANES):
-                    real = yr[i, lane] * re[i, i, lane] - yi[i, lane] * im[i, i, lane]
-                    yi[i, lane] = yr[i, lane] * im[i, i, lane] + yi[i, lane] * re[i, i, lane]
-                    yr[i, lane] = real
-            for lane in range(min(LANES, total - c * LANES)):
-                k, q = (c * LANES + lane) // P, (c * LANES + lane) % P
+                    for entry in range(BATCH):
+                        yr[i, entry] -= re[i, j, entry] * yr[j, entry] - im[i, j, entry] * yi[j, entry]
+                        yi[i, entry] -= re[i, j, entry] * yi[j, entry] + im[i, j, entry] * yr[j, entry]
+                for entry in range(BATCH):
+                    real = yr[i, entry] * re[i, i, entry] - yi[i, entry] * im[i, i, entry]
+                    yi[i, entry] = yr[i, entry] * im[i, i, entry] + yi[i, entry] * re[i, i, entry]
+                    yr[i, entry] = real
+            for entry in range(min(BATCH, total - c * BATCH)):
+                k, q = (c * BATCH + entry) // P, (c * BATCH + entry) % P
                 for a in range(n - 2):
-                    x[row, k, q * last + a + 1] = complex(yr[a, lane], yi[a, lane])
+                    x[row, k, q * last + a + 1] = complex(yr[a, entry], yi[a, entry])
     return x
