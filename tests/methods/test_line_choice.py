@@ -46,7 +46,7 @@ def taken(monkeypatch, drift, kind, prior=1.0, method="yau-yau", **keys):
     ("name", "case"),
     [
         ("a Gaussian kernel", {"drift": "tanh(x)", "kind": "samples", "method": "limited-direct", "prior": 1e-4}),
-        ("finite volumes", {"drift": "x - x**3", "kind": "samples", "prior": 100.0}),
+        ("panels", {"drift": "x - x**3", "kind": "samples", "prior": 100.0}),
         ("substeps of Magnus' series", {"drift": "1 + sin(x)/2", "kind": "samples", "diffusion": [["0.03"]]}),
         ("modes of the operator", {"drift": "-x", "kind": "samples", "prior": 400.0}),
     ],

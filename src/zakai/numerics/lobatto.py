@@ -1,10 +1,4 @@
-"""Polynomials on intervals by their values at Gauss-Lobatto points, and the Kolmogorov operator without flux at the ends.
-
-    L u = ((G u)' / 2 - f u)',      (G u)' / 2 - f u = 0 at both ends
-
-The weak form int phi L u = -int phi' ((G u)' / 2 - f u) has the condition of no flux in it: the solution is spectrally accurate
-up to the ends, and to kinks and jumps of the coefficients where two intervals meet.
-"""
+"""Polynomials on intervals side by side, by their values at Gauss-Lobatto points."""
 
 from __future__ import annotations
 
@@ -121,43 +115,6 @@ class Element(NamedTuple):
         """The weights (N,) of the quadrature."""
         return _geometry(self)[2]
 
-    def symmetric(self, covariance: Array, slope: Array, joined: Array) -> Array:
-        """Return -L (N - C, N - C) as a symmetric operator, for G (N,) and s'/s (N,).
-
-        With u = s psi the flux is s G (psi' - psi s'/s) / 2, and the weak form is
-
-            sum W G (phi' - phi s'/s) (psi' - psi s'/s) / 2.
-
-        Args:
-            covariance: G.
-            slope: s'/s.
-            joined: from what the operator acts on to psi W^(1/2) at the points (N, N - C), of orthogonal columns of length one.
-        """
-        root, count = np.sqrt(self.weights), len(self.halves)
-        flux = -np.diag(slope)
-        for j, half in enumerate(self.halves):
-            here = slice(j * self.size, (j + 1) * self.size)
-            flux[here, here] += rule(self.size).derivative / half
-        flux = flux * (root * np.sqrt(0.5 * covariance))[:, None] / root
-        flux = flux if count == 1 else flux @ joined
-        return np.asarray(flux.T @ flux)
-
-    def joined(self, logs: Array) -> Array:
-        """Return the matrix (N, N - C) whose columns are psi W^(1/2) that is s times a function that is continuous at the cuts.
-
-        Args:
-            logs: log s at the points (N,).
-        """
-        total = self.size * len(self.halves)
-        result = np.zeros((total, total - len(self.cuts)))
-        columns = np.arange(total) - np.arange(total) // self.size
-        result[np.arange(total), columns] = 1.0
-        for j in range(1, len(self.halves)):
-            k = j * self.size
-            both = np.sqrt(self.weights[k - 1 : k + 1]) * np.exp(logs[k - 1 : k + 1] - np.max(logs[k - 1 : k + 1]))
-            result[k - 1 : k + 1, columns[k]] = both / np.sqrt(np.sum(both**2))
-        return result
-
     def derivative(self, values: Array) -> Array:
         """Return the derivative of polynomials at the points from their values there (N,)."""
         result = values.reshape(-1, self.size) @ rule(self.size).derivative.T / self.halves[:, None]
@@ -167,15 +124,43 @@ class Element(NamedTuple):
         """Return the matrix (J, N) from values to those of the polynomials at points (J,)."""
         return interpolation(self.points, self.weights, points)
 
+    def panel(self, points: Array) -> Array:
+        """Return the interval (J,) in which points are."""
+        return np.searchsorted(np.asarray(self.cuts), points, side="right")
+
     def at(self, values: Array, points: Array) -> Array:
         """Return the density at points (J,) from probabilities; zero beyond the ends."""
-        inside = (points >= self.lower) & (points <= self.upper)
-        return np.asarray(np.where(inside, self.interpolation(points) @ (values / self.weights), 0.0))
+        inside, panel = (points >= self.lower) & (points <= self.upper), self.panel(points)
+        apart = points[:, None] - self.points.reshape(-1, self.size)[panel]
+        same = np.abs(apart) <= _NEAR * self.halves[panel, None]
+        terms = np.where(same.any(axis=1)[:, None], same, _barycentric(rule(self.size).weights) / np.where(same, 1.0, apart))
+        own = (values / self.weights).reshape(-1, self.size)[panel]
+        return np.asarray(np.where(inside, np.sum(terms * own, axis=1) / np.sum(terms, axis=1), 0.0))
+
+    def finer(self, values: Array, size: int) -> Array:
+        """Return the polynomials with values (N,) at as many other points in each interval."""
+        own = rule(self.size)
+        matrix = interpolation(own.points, own.weights, rule(size).points)
+        return np.asarray((values.reshape(-1, self.size) @ matrix.T).reshape(-1))
+
+    def sums(self, values: Array) -> Array:
+        """Return the sums over the points of each interval (P,)."""
+        return values.reshape(-1, self.size).sum(axis=1)
+
+    def tails(self, values: Array) -> Array:
+        """Return the highest Legendre coefficients of each interval (P,): |c_n| + |c_n-1|, or a tenth of the two before."""
+        fourth, third, second, first = np.abs(values.reshape(-1, self.size) @ rule(self.size).analysis[-4:].T).T
+        return np.maximum(first + second, 0.1 * (third + fourth))
+
+    def bisected(self, where: Array) -> Element:
+        """Return the element with some of its intervals (P,) bisected."""
+        ends = np.array([self.lower, *self.cuts, self.upper])
+        middles = 0.5 * (ends[1:] + ends[:-1])[where]
+        return self._replace(cuts=tuple(np.sort(np.concatenate([ends[1:-1], middles])).tolist()))
 
     def unresolved(self, values: Array) -> float:
-        """Return the largest Legendre coefficient in the highest eighth, relative to the largest of all."""
-        coefficients = np.abs((values / self.weights).real.reshape(-1, self.size) @ rule(self.size).analysis.T)
-        return float(coefficients[:, -max(3, self.size // 8) :].max() / coefficients.max())
+        """Return the largest share of the mass that an interval leaves unresolved."""
+        return float(np.max(2.0 * self.halves * self.tails((values / self.weights).real)) / np.sum(np.abs(values.real)))
 
 
 @lru_cache(maxsize=256)

@@ -1,7 +1,7 @@
 """A message of one state over one interval, backward in time, where the compiled loop refuses it.
 
 A Gaussian kernel is a sum over a grid.  On the circle the transposed exponentials of the filter act, on the line a grid that
-moves (`line/gauged.py`) where the drift carries the density, and else finite volumes (`line/volumes.py`).
+moves (`line/gauged.py`) where the drift carries the density, and else panels (`line/panels.py`).
 """
 
 from __future__ import annotations
@@ -13,10 +13,10 @@ from zakai.methods.line.domain import ends_of_leak
 from zakai.methods.line.gauged import by_moving_grid
 from zakai.methods.line.kernel import kernel_of
 from zakai.methods.line.message import Message, points_of, reliable
+from zakai.methods.line.panels import Problem, pulled_back
 from zakai.methods.line.prepared import Prepared, State, TimeInterval
 from zakai.methods.line.report import Report
 from zakai.methods.line.transition import MOST_SUBSTEPS, Substep, parts_of_split, trial_substep
-from zakai.methods.line.volumes import WIDENINGS, cell_plan_of, ends_of, pulled_back
 from zakai.numerics.arrays import Array
 from zakai.numerics.line import window as lw
 from zakai.numerics.line.backward import FEWEST, SMALLEST
@@ -106,7 +106,7 @@ def pulled(prepared: Prepared, interval: TimeInterval, state: State, message: Me
         dense = by_moving_grid(prepared, interval, state, message, accepted)
         if dense is not None and dense[1] <= smoothing_tolerance(prepared):
             return dense
-    result = _by_volumes(prepared, interval, state, ends, message, leak)
+    result = _by_panels(prepared, interval, state, ends, message)
     return dense if dense is not None and dense[1] < result[1] else result
 
 
@@ -136,29 +136,20 @@ def _by_kernel(
     return Message.of(result, new, new.spacing, message.error), report.time
 
 
-def _by_volumes(
-    prepared: Prepared, interval: TimeInterval, state: State, ends: tuple[float, float], message: Message,
-    leak: Array | None,
-) -> tuple[Message, float]:  # fmt: skip
-    """Return the same by finite volumes, of infinite error where they do not serve; with a leak they reach its ends."""
+def _by_panels(
+    prepared: Prepared, interval: TimeInterval, state: State, ends: tuple[float, float], message: Message
+) -> tuple[Message, float]:
+    """Return the same by panels, of infinite error where they do not serve."""
     values, window = np.asarray(state.values).real, state.window
-    mean, variance = message.moments
-    widening = np.inf if leak is None else WIDENINGS[-1] * (ends[1] - ends[0])
-    plan = cell_plan_of(prepared, values, window, ends_of(values, window), interval, (mean, variance**0.5), widening)
-    if plan is not None and leak is not None:
-        plan = plan._replace(cells=plan.cells.reaching(*leak))
-
-    def density(offsets: Array) -> Array:
-        return lw.density_at(values, window, offsets)
-
-    result = pulled_back(prepared, message.falling, density, plan, interval)
+    problem = Problem.of_grid(prepared, interval, values, window)
+    result = pulled_back(problem, lambda x: message.falling(x - state.origin), message.window.points)
     if result is None:
         return message._replace(logs=np.full(len(message.logs), np.nan)), np.inf
     least, _ = _noise(prepared, interval.k, *(state.origin + np.array(message.ends)))
     needed = min(max(message.needed, 0.5 * SPACING_OF_NOISE * least), window.spacing)
     new = points_of(window, *ends, needed)
-    values = result.at(new.offsets)
-    logs = np.log(np.maximum(values, SMALLEST * np.max(values))) + result.log_scale
+    values = result.extended(new.points)
+    logs = np.log(np.maximum(values, SMALLEST * np.max(values))) + float(result.log_scale.real)
     return Message.of(logs, new, needed, message.error), result.error
 
 

@@ -22,7 +22,6 @@ class Derived(Enum):
     TABLES = "f, h and G at the points of a grid"
     MODES = "the decomposition of the operator on a grid"
     MESSAGE_MODES = "the decomposition of the operator of messages on a grid"
-    LOBATTO_MODES = "the decomposition of the operator on an element"
     EXPONENTIAL = "the exponential of the operator on a grid, for one length"
     COARSE_GRIDS = "grids and their modes as the compiled loop reads them"
     PROFILE = "f, f' and G around an origin"

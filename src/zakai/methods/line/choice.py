@@ -15,11 +15,11 @@ import numpy as np
 
 from zakai.methods.line.coefficients import on_grid_for_drift, travel
 from zakai.methods.line.kernel import by_kernel, kernel_of
+from zakai.methods.line.panels import contracted
 from zakai.methods.line.prepared import Prepared, TimeInterval
 from zakai.methods.line.report import Report
 from zakai.methods.line.transition import Prediction, by_decomposition, by_substeps
 from zakai.methods.line.update import refitted
-from zakai.methods.line.volumes import contracted
 from zakai.numerics.arrays import Array
 from zakai.numerics.line import window as lw
 from zakai.numerics.line.gaussian_kernels import Channel
@@ -93,7 +93,7 @@ def _always(density: Density) -> bool:
     return True
 
 
-def _by_volumes(density: Density) -> Prediction | None:
+def _by_panels(density: Density) -> Prediction | None:
     moving = density.travel > MOVING
     return contracted(density.prepared, density.values, density.window, density.interval, density.report, moving)
 
@@ -130,8 +130,8 @@ MECHANISMS = (
         "1 ms, and 1 to 9 ms for a new grid", TESTS + "test_line_separate_modes.py", _is_steady, _by_modes,
     ),
     Mechanism(
-        "finite volumes", "the drift contracts the density by much, coefficients have kinks or jumps, or a natural end is near",
-        "10 to 100 ms", TESTS + "test_line_broad_priors.py", _always, _by_volumes,
+        "panels", "the drift contracts the density by much, coefficients have kinks or jumps, or a natural end is near",
+        "2 to 10 ms", TESTS + "test_line_broad_priors.py", _always, _by_panels,
     ),
     Mechanism(
         "substeps of Magnus' series", "always; the grid moves with a density that travels",

@@ -18,7 +18,7 @@ about
 
     e^p,    p = (kappa - 1) / (kappa + 1 - k).
 
-At the limit of Feller, kappa = 1, that is no small number for any e.  Finite volumes without flux at their ends lose nothing.
+At the limit of Feller, kappa = 1, that is no small number for any e.  Panels without flux at their ends lose nothing.
 """
 
 from __future__ import annotations
@@ -98,6 +98,12 @@ def on_the_line(model: Model) -> Model:
         log_density=None if model.log_density is None else transformed(model.log_density),
     )
     return other
+
+
+def reflecting_ends(prepared: Prepared) -> tuple[float, float]:
+    """Return the ends of the domain where these reflect, else infinite ones."""
+    domain = prepared.model.domain.get(prepared.model.state[0], Interval())
+    return (domain.lower, domain.upper) if prepared.system.reflecting else (-np.inf, np.inf)
 
 
 NEAR_END = 1e-9  # distance from an end other than zero, relative to it and to the length of the domain

@@ -1,12 +1,9 @@
 """The backward pass for one state between ends and kinks, and draws of the state at the start of an interval.
 
-The message is on a uniform grid, the smoothed density on elements.  The modes of the operator take a message back over an
-interval, and finite volumes where these do not serve.  Draws follow the law
-
-    x ~ p(x) T(x, z),      T(x, z) = s(z) / s(x) sum_j psi_j(x) psi_j(z) exp(-tau lambda_j).
-
-The transition T is that of the modes at Gauss-Lobatto points, in parts of the domain that resolve it.  Where coefficients
-depend on t, it is a product of transitions with those at the middles of substeps.
+The message is on a uniform grid, the smoothed density on panels.  The transposed operator on panels takes a message back over an
+interval (`line/panels.py`).  Draws follow the law p(x) T(x, z) of the state at the start, given z at the end, with the transition
+T of exponentials of the operator on panels.  Where coefficients depend on t, it is a product of transitions with those at the
+middles of substeps.
 """
 
 from __future__ import annotations
@@ -19,38 +16,35 @@ import numpy as np
 from zakai.densities import IntervalDensity
 from zakai.methods._protocol import Backward, Info
 from zakai.methods.line.backward import accuracy
-from zakai.methods.line.backward_interval import negligible, smoothing_tolerance
-from zakai.methods.line.coefficients import coefficients, covariance_at, resolved_parts
+from zakai.methods.line.backward_interval import negligible
+from zakai.methods.line.coefficients import covariance_at
 from zakai.methods.line.message import SURE_OF_DENSITY, Message, points_of
-from zakai.methods.line.prepared import Prepared, TimeInterval
+from zakai.methods.line.panels import SIZES, Operator, Problem, panels_between, pulled_back
+from zakai.methods.line.prepared import Prepared
 from zakai.methods.line.update import factor_at_end
-from zakai.methods.line.volumes import cell_plan_of, pulled_back
 from zakai.methods.reflecting import filter as reflecting_filter
 from zakai.methods.reflecting.elements import (
-    ELEMENT_SIZES,
-    apart,
-    decomposed,
+    SAMPLES,
     domain_of,
-    element_of,
     logarithm,
     moments,
     negligible_of,
-    operator_at,
     placed,
     reached,
     sampled,
-    weighted,
 )
 from zakai.methods.reflecting.filter import State
-from zakai.numerics.arrays import Array, Number
+from zakai.numerics.arrays import Array
 from zakai.numerics.line import window as lw
-from zakai.numerics.line.backward import EXCURSION, SMALLEST
+from zakai.numerics.line.backward import SMALLEST
 from zakai.numerics.line.density import support
-from zakai.numerics.line.resolution import NOISE, ROUNDING, SMOOTHER_SHARE, SUPPORT
+from zakai.numerics.line.rational import CONTRACTION, Factors, separated
+from zakai.numerics.line.resolution import NOISE, SUPPORT
 from zakai.numerics.lobatto import Element
 
 PIECE = 10.0  # standard deviations of the noise in which states at the end share a transition
-RESOLVING = 3.7  # points in a standard deviation
+MOST_OF_TRANSITION = 24  # panels of a transition that are bisected
+RESOLVED_LENGTH = 3.0  # of a panel in standard deviations of the noise
 RESOLVED_DENSITY = 1e-6  # Legendre coefficient of a density that the points of the transition resolve
 FINE = 4  # points in a spacing between which a distribution is interpolated
 SUBSTEPS = 4  # of a part in which the coefficients are polynomials of time
@@ -80,8 +74,9 @@ def draw(
         near = np.abs(drift[(x >= first - wide) & (x <= last + wide)])
         reach = wide + length * float(np.max(near, initial=0.0))
         lower, upper = max(first - reach, low), min(last + reach, high)
-        needed = RESOLVING * 2.0 * float(np.max(element_of(prepared, lower, upper, ELEMENT_SIZES[0]).halves)) / deviation
-        piece = element_of(prepared, lower, upper, next((size for size in ELEMENT_SIZES if size >= needed), ELEMENT_SIZES[-1]))
+        piece = panels_between(prepared, lower, upper, start)._replace(size=SIZES[1])
+        while len(piece.halves) < MOST_OF_TRANSITION and (coarse := piece.halves > 0.5 * RESOLVED_LENGTH * deviation).any():
+            piece = piece.bisected(coarse)
         result[places] = _drawn(prepared, k, piece, z[places], observed, state, uniform[places])
     return np.clip(result, domain_of(prepared).lower, domain_of(prepared).upper)[:, None], 0.0
 
@@ -103,28 +98,21 @@ def _drawn(prepared: Prepared, k: int, piece: Element, z: Array, observed: np.nd
 
 
 def _transition(prepared: Prepared, k: int, piece: Element, before: Array, observed: np.ndarray) -> Array:
-    """Return T (N, N) from the points of an element to the densities at them, weighted by what is observed inside."""
+    """Return T (N, N) from the points of panels to the densities at them, weighted by what is observed inside."""
     interval = prepared.interval(k, prepared.inside[k], observed)
-    _, start, length, inside, rates = interval
-    bounds, result = [(0.0, length)], np.eye(len(piece.points))
-    if prepared.system.varying:
-        parts = resolved_parts(prepared, before, piece, interval).bounds
-        cuts = [np.linspace(*part, SUBSTEPS + 1) for part in parts]
-        bounds = [(float(a), float(b)) for cut in cuts for a, b in zip(cut[:-1], cut[1:], strict=True)]
-    for first, last in bounds:
-        middle = np.array([start + 0.5 * (first + last)])
-        known = operator_at(prepared, piece, float(middle[0]))
-        if known is None:
-            return np.full_like(result, np.nan)
-        _, _, potential, _ = coefficients(prepared, piece, middle, inside, rates, before)
-        modes = known.weighted(potential[0]) if inside.any() else known.modes
-        s = modes.scale[:, None]
-        result = s * modes.decayed(result / s, last - first)
-    return np.asarray(result / piece.weights[:, None])
+    ends = np.array([piece.lower, piece.upper])
+    problem = Problem.of(prepared, interval, piece, before * piece.weights, lambda x: before, ends)
+    operator, result = Operator(problem, piece), np.eye(len(piece.points) - len(piece.cuts))
+    for low, high in problem.parts.bounds:
+        blocks, count = operator.part(low, high), SUBSTEPS if prepared.system.varying else 1
+        step = (high - low) / count
+        for first in np.linspace(low, high, count + 1)[:-1]:
+            middle = np.array([first + 0.5 * step])
+            result = Factors.of(piece, blocks(middle, step)[0], CONTRACTION.values).exponential(result)
+    return separated(piece, operator.density(result, interval.length).T)
 
 
 POINTS = 256  # of a message, on the whole element of the density
-QUADRATURE = 192  # points at which a message is projected onto the modes
 
 
 def _window(prepared: Prepared, lower: float, upper: float) -> lw.Window:
@@ -150,17 +138,18 @@ class _Product(NamedTuple):
 
 def _product(prepared: Prepared, state: State, message: Message) -> _Product:
     element, values = state.element, np.asarray(state.values).real
-    floor = SURE_OF_DENSITY * (NOISE + element.unresolved(values)) * np.max(values / element.weights)
+    known = values / element.weights
+    floor = SURE_OF_DENSITY * (NOISE * np.max(known) + element.tails(known))
 
     def logs(x: Array) -> Array:
         density = element.at(values, x)
-        return np.where(density > floor, logarithm(density), -np.inf) + message.at(x - message.origin)
+        return np.where(density > floor[element.panel(x)], logarithm(density), -np.inf) + message.at(x - message.origin)
 
     lower, upper = placed(logs, element.lower, element.upper, domain_of(prepared))
     lower, upper = max(lower, element.lower), min(upper, element.upper)
-    top = float(np.max(logs(np.linspace(lower, upper, 4 * element.size))))
+    top = float(np.max(logs(np.linspace(lower, upper, SAMPLES))))
     allowed = negligible_of(prepared, float(state.error) + message.error)
-    new, result = sampled(prepared, lambda x: np.exp(logs(x) - top), lower, upper, allowed)
+    new, result = sampled(prepared, lambda points: np.exp(logs(points.points) - top) * points.weights, lower, upper, allowed)
     total = float(np.sum(result))
     return _Product(result / total, new, float(np.log(total)) + top)
 
@@ -200,81 +189,16 @@ def step(prepared: Prepared, k: int, message: Message, observed: np.ndarray, sta
         """Return the logarithm of the message with the likelihood, whose jumps no grid holds."""
         return later.at(x - later.origin) + (0.0 if likelihood is None else likelihood.logs(x).real)
 
+    element, values = state.element, np.asarray(state.values).real
+    ends = np.array([element.lower, element.upper])
     interval = prepared.interval(k, inside, observed)
-    result = None if prepared.system.varying else _by_modes(prepared, message, logs, interval, state)
-    result = _by_volumes(prepared, message, logs, interval, state) if result is None else result
+    problem = Problem.of(prepared, interval, element, values, lambda x: element.at(values, x), ends)
+    solution = pulled_back(problem, logs, message.window.points)
+    if solution is None:
+        return last_message(prepared, state)._replace(error=np.inf)
+    result = _on(prepared, state, solution.extended, float(solution.log_scale.real), solution.error)
     retained = float(np.clip(message.variance / np.sqrt(max(before * result.variance, 1e-300)), 0.3, 1.0))
     return result._replace(error=result.error + retained * message.error)
-
-
-def _by_modes(
-    prepared: Prepared, message: Message, logs_at: Callable[[Array], Array], interval: TimeInterval, state: State
-) -> Message | None:
-    """Return the message at the start of an interval by the modes of the operator, None where they do not serve.
-
-        b(start) = U exp(-tau lambda) U' s b(stop) / s
-
-    s b is projected onto the modes by the quadrature of its own points.  The error of rounding, and of what is not resolved after
-    the interval, counts where the density is.
-    """
-    _, start, length, inside, _ = interval
-    own, values = state.element, np.asarray(state.values).real
-    G = covariance_at(prepared.system, own.points, start, prepared.theta.real)
-    reach = EXCURSION * float(np.sqrt(np.max(G) * length))
-    domain = domain_of(prepared)
-    low, high = np.clip([message.origin + end for end in message.ends], domain.lower, domain.upper).tolist()
-    lower, upper = apart(min(own.lower, low) - reach, max(own.upper, high) + reach, domain)
-    after = element_of(prepared, low, high, QUADRATURE)
-    logs = logs_at(after.points)
-    top = float(np.max(logs))
-    constant: Number = 0.0
-    bound = 1.0  # an expectation is at most the largest value; far out, where s is small, its rounding exceeds that
-    weights = after.weights * np.exp(logs - top)
-    for size in ELEMENT_SIZES[1:]:
-        element = element_of(prepared, lower, upper, size)
-        known = decomposed(prepared, element)
-        if known is None:
-            return None
-        density, modes, root = own.at(values, element.points) * element.weights, known.modes, np.sqrt(element.weights)
-        if inside.any():
-            modes, potential, constant = weighted(prepared, known, element, interval, density)
-            bound = float(np.exp(np.max((potential - constant).real)))
-        between = element.interpolation(after.points)
-        psi = (between.T @ (weights * np.exp(between @ known.logs - modes.top))) / root
-        propagated = modes.decayed(psi, length)
-        at, log_s, scaled = element.interpolation(own.points), modes.top - known.logs, propagated / root
-        own_weights = np.abs(values) * np.exp(at @ log_s)
-        wrong = max(ROUNDING * float(np.exp(-length * modes.rates[0])), element.unresolved(propagated * root))
-        wrong = wrong * max(float(np.sqrt(psi @ psi)), float(np.max(np.abs(scaled))))
-        error = wrong * float(np.sum(own_weights)) / float(own_weights @ (at @ scaled))
-        if 0.0 <= error < SMOOTHER_SHARE * smoothing_tolerance(prepared):
-            break
-    else:
-        return None
-
-    def expectation(x: Array) -> Array:
-        at = element.interpolation(x)
-        return np.asarray(np.minimum((at @ scaled) * np.exp(at @ log_s), bound))
-
-    return _on(prepared, state, expectation, top + float(constant.real), error)
-
-
-def _by_volumes(
-    prepared: Prepared, message: Message, logs_at: Callable[[Array], Array], interval: TimeInterval, state: State
-) -> Message:
-    """Return the message at the start of an interval by finite volumes."""
-    element, values = state.element, np.asarray(state.values).real
-    ends, (mean, variance) = np.array([0.0, element.upper - element.lower]), message.moments
-    shift = element.lower - message.origin
-    aim = mean - shift, variance**0.5
-    plan = cell_plan_of(prepared, values, element, ends, interval, aim)
-    result = pulled_back(
-        prepared, lambda x: logs_at(x + element.lower), lambda x: element.at(values, element.lower + x), plan, interval
-    )
-    if result is None:
-        return last_message(prepared, state)._replace(error=np.inf)
-    expectation = result
-    return _on(prepared, state, lambda x: expectation.at(x - element.lower), expectation.log_scale, expectation.error)
 
 
 def _on(prepared: Prepared, state: State, expectation: Callable[[Array], Array], log_scale: float, error: float) -> Message:

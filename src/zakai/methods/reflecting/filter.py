@@ -20,11 +20,9 @@ from zakai.methods.line.prepared import Prepared
 from zakai.methods.line.report import Report
 from zakai.methods.line.update import error_remainder, factor_at_end, outside_tables, spread
 from zakai.methods.reflecting.elements import (
-    ELEMENT_SIZES,
     SAMPLES,
-    SIZES_OF_PRIORS,
+    coarse,
     domain_of,
-    element_of,
     logarithm,
     moments,
     negligible_of,
@@ -90,7 +88,12 @@ def init(prepared: Prepared, prior: Prior) -> State:
 
     lower, upper = placed(lambda x: logs(x).real, lower, upper, domain)
     top, negligible = _top(logs, lower, upper), negligible_of(prepared)
-    element, values = sampled(prepared, lambda x: np.exp(without_nan(logs(x)) - top), lower, upper, negligible, SIZES_OF_PRIORS)
+
+
+    def probabilities(element: Element) -> Array:
+        return np.exp(without_nan(logs(element.points)) - top) * element.weights
+
+    element, values = sampled(prepared, probabilities, lower, upper, negligible)
     return State.of(values / np.sum(values), element, max(element.unresolved(values) - negligible, 0.0))
 
 
@@ -116,25 +119,21 @@ def _multiplied(
     prepared: Prepared, values: Array, element: Element, likelihood: Likelihood, report: Report, negligible: float
 ) -> tuple[Array, Element, Number]:
     """Return the product with a likelihood, its points, and the logarithm of its mass."""
-    domain, new, density = domain_of(prepared), element, values / element.weights
-    largest = float(np.max(density.real))
+    domain, largest = domain_of(prepared), float(np.max((values / element.weights).real))
 
-    def product() -> tuple[Array, Number, float, float]:
-        return normalized(density, without_nan(likelihood.logs(new.points)), new.weights, largest)
+    def product(points: Element) -> tuple[Array, Number, float, float]:
+        density = values / element.weights if points == element else element.at(values, points.points)
+        return normalized(density, without_nan(likelihood.logs(points.points)), points.weights, largest)
 
-    result, gained, depth, growth = product()
-    if not new.unresolved(result) < negligible or _narrow(result, new):
-        logs = logarithm(density.real)
+    new, (result, gained, depth, growth) = element, product(element)
+    if coarse(result, new, negligible).any() or _narrow(result, new):
+        logs = logarithm((values / element.weights).real)
         ends = place(element.offsets, np.maximum(logs, np.max(logs) - DEPTH_OF_PRODUCT), likelihood, element.lower)
         if ends is not None:
             low, high = with_margin(element.lower + ends[0], element.lower + ends[1], domain)
             low, high = max(low, element.lower), min(high, element.upper)
-            for size in ELEMENT_SIZES:
-                new = element_of(prepared, low, high, size)
-                density = element.at(values, new.points)
-                result, gained, depth, growth = product()
-                if new.unresolved(result) < negligible:
-                    break
+            new, _ = sampled(prepared, lambda points: product(points)[0], low, high, negligible)
+            result, gained, depth, growth = product(new)
     report.aliasing, report.depth = max(report.aliasing, new.unresolved(result)), depth
     report.growth = max(report.growth, 1.0) * growth
     return result, new, gained

@@ -66,7 +66,7 @@ ALIGNMENT = 8  # centres are at multiples of so many spacings
 
 
 class Points(Protocol):
-    """Points that carry a density: those of a uniform grid, of cells, or of Gauss-Lobatto elements."""
+    """Points that carry a density: those of a uniform grid, or of Gauss-Lobatto elements."""
 
     @property
     def origin(self) -> float:
