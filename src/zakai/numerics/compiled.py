@@ -115,7 +115,7 @@ def working_time() -> float:
 def kernel(signature: Any, derivative: Any = None, *, reordered: bool = False) -> Callable[[Callable[..., R]], Callable[..., R]]:
     """Return a decorator that compiles a function for one signature when it is first called, by Python or by another kernel.
 
-    The compiled code is kept in `kernel_cache.folder()`.  Where there is none, the function is compiled in every process.
+    The compiled code is kept in `kernel_cache.folder_of` its module; without one, the function is compiled in every process.
 
     Args:
         signature: the types of the arguments and of the result.
@@ -126,7 +126,7 @@ def kernel(signature: Any, derivative: Any = None, *, reordered: bool = False) -
     fastmath = set(_REORDERED) if reordered else False
 
     def decorate(function: Callable[..., R]) -> Callable[..., R]:
-        with caching() as kept:
+        with caching(function.__module__) as kept:
             try:
                 dispatcher = _compiler(cache=kept, fastmath=fastmath)(function)
             except RuntimeError:  # a function without a file

@@ -1,11 +1,19 @@
-"""The folder in which compiled kernels are kept: the user's, never that of the package."""
+"""The folder in which compiled kernels are kept: the user's, never that of the package.
+
+Numba compiles a kernel again where its own file has changed, and not where a function or a constant has that it imports.  Kernels
+are therefore kept in a folder for the text of their module and of all modules of this package that it imports.
+"""
 
 from __future__ import annotations
 
+import hashlib
 import os
+import re
+import shutil
 import stat
 import sys
 import tempfile
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cache
@@ -16,6 +24,8 @@ from typing import Any
 import numba
 
 _CONFIG: Any = numba.config  # of which CACHE_DIR is the environment variable NUMBA_CACHE_DIR
+_IMPORT = re.compile(r"^(?:from|import) (zakai[\w.]*)(?: import ([^\n(]*))?", re.MULTILINE)
+OLD = 30 * 86400.0  # seconds after which kernels of another text are deleted
 
 
 @cache
@@ -42,10 +52,46 @@ def folder() -> Path | None:
     return temporary / name if _is_writable(temporary) and _is_private(temporary) and _is_writable(temporary / name) else None
 
 
+@cache
+def folder_of(module: str) -> Path | None:
+    """Return the folder of the kernels of a module, None where none can be written."""
+    parent = folder()
+    if parent is None:
+        return None
+    texts = sorted(_text(name) for name in _imported(module))
+    own = parent / module.rpartition(".")[2] / hashlib.sha256("\0".join(texts).encode()).hexdigest()[:16]
+    for other in own.parent.glob("*") if not own.exists() else ():
+        if time.time() - other.stat().st_mtime > OLD:
+            shutil.rmtree(other, ignore_errors=True)
+    return own if _is_writable(own) else None
+
+
+def _imported(module: str) -> set[str]:
+    """Return a module and all modules of this package that it imports, or that these import."""
+    found, left = set[str](), [module]
+    while left:
+        name = left.pop()
+        if name in found or name not in sys.modules:
+            continue
+        found.add(name)
+        for source, names in _IMPORT.findall(_text(name)):
+            left += [source, *(f"{source}.{part.split()[0]}" for part in names.split(",") if part.split())]
+    return found
+
+
+@cache
+def _text(module: str) -> str:
+    """Return the text of a module, nothing where there is none."""
+    try:
+        return Path(sys.modules[module].__file__ or "").read_text(encoding="utf-8")
+    except (OSError, TypeError, AttributeError):
+        return ""
+
+
 @contextmanager
-def caching() -> Iterator[bool]:
-    """Let Numba keep the kernels that are declared inside in `folder()`; yield whether there is one."""
-    where, before = folder(), _CONFIG.CACHE_DIR
+def caching(module: str) -> Iterator[bool]:
+    """Let Numba keep the kernels of a module that are declared inside in their folder; yield whether there is one."""
+    where, before = folder_of(module), _CONFIG.CACHE_DIR
     if where is not None:
         _CONFIG.CACHE_DIR = str(where)
     try:
