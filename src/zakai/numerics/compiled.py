@@ -126,7 +126,7 @@ def kernel(signature: Any, derivative: Any = None, *, reordered: bool = False) -
     fastmath = set(_REORDERED) if reordered else False
 
     def decorate(function: Callable[..., R]) -> Callable[..., R]:
-        with caching(function.__module__) as kept:
+        with caching(function.__module__ or "") as kept:
             try:
                 dispatcher = _compiler(cache=kept, fastmath=fastmath)(function)
             except RuntimeError:  # a function without a file
