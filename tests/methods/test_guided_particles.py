@@ -563,14 +563,15 @@ def test_a_smoother_warns_of_large_standard_errors():
     assert "monte_carlo_error exceeds 0.1" in " ".join(result.warnings)
 
 
-def test_mass_beyond_a_table_is_warned_of():
+@pytest.mark.parametrize("method", [PARTICLES, "tensor-train"])
+def test_mass_beyond_a_table_is_warned_of(method):
     charge, voltage = np.linspace(0, 1, 6), [3.0, 3.4, 3.5, 3.55, 3.7, 4.05]
     model = zakai.Model(
         state=["s", "b"], drift=["-0.3", "-b"], diffusion=[[0.02, 0], [0, 0.02]], observation=["ocv(s) + b"],
         observation_kind="samples", observation_noise=[[1e-4]], tables={"ocv": (charge, voltage)},
         prior={"kind": "gaussian", "mean": [0.3, 0], "cov": [1e-3, 4e-4]},
     )  # fmt: skip
-    result = zakai.filter(model, zakai.Record([0.5, 1.0, 2.0], [3.3, 3.0, 3.0], "samples"), PARTICLES, particles=2000)
+    result = zakai.filter(model, zakai.Record([0.5, 1.0, 2.0], [3.3, 3.0, 3.0], "samples"), method)
     assert result.health["outside_tables"][1] < 1e-3 < 0.9 < result.health["outside_tables"][3]
     assert "outside_tables" in " ".join(result.warnings)
 

@@ -17,7 +17,7 @@ from zakai.densities import TensorTrainDensity
 from zakai.densities._values import wrap
 from zakai.methods._protocol import Info
 from zakai.methods.frame import again
-from zakai.methods.frame.build import Builder
+from zakai.methods.frame.build import CLOUD, Builder
 from zakai.methods.frame.chain import MOST_SUBSTEPS, Chain, Prediction, extrapolated
 from zakai.methods.frame.errors import Error, root_of
 from zakai.methods.frame.moves import Shift
@@ -168,7 +168,7 @@ def step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[State
         check_escape(prepared, k, lambda: prepared.train(state).moments(), infinity)
 
     if np.isnan(state.cores[0]).any():  # a density that is lost stays lost
-        return _lost(state)
+        return _lost(prepared, state)
     check(infinity=False)
     try:
         after, lost = _step(prepared, k, state, values)
@@ -177,14 +177,19 @@ def step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[State
         return after
     except (Unresolved, np.linalg.LinAlgError):
         check(infinity=True)
-        return _lost(state)
+        return _lost(prepared, state)
 
 
-def _lost(state: State) -> tuple[State, Info]:
+def figures_of(prepared: Prepared) -> tuple[str, ...]:
+    """Return the names of the health figures of a system."""
+    return (*FIGURES, "outside_tables") if prepared.system.base.outside else FIGURES
+
+
+def _lost(prepared: Prepared, state: State) -> tuple[State, Info]:
     """Return a state whose density is lost, and its report."""
     n = len(state.cores)
     state = state._replace(cores=tuple(np.full_like(core, math.nan) for core in state.cores))
-    return state, Info(math.nan, np.full(n, math.nan), np.full((n, n), math.nan), dict.fromkeys(FIGURES, math.nan))
+    return state, Info(math.nan, np.full(n, math.nan), np.full((n, n), math.nan), dict.fromkeys(figures_of(prepared), math.nan))
 
 
 def _step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[tuple[State, Info], float]:
@@ -193,7 +198,7 @@ def _step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[tupl
     choices, key = prepared.choices, (tuple(prepared.model.state), control.interval)
     known = None if choices is None else choices.made.get(key)
     if isinstance(known, Made):
-        return again.step(Chain(prepared, interval, values, Builder(prepared)), state, known, FIGURES), 0.0
+        return again.step(Chain(prepared, interval, values, Builder(prepared)), state, known, figures_of(prepared)), 0.0
     builder = builder_of(prepared, state)
     chain = Chain(prepared, interval, values, builder)
     likelihood = prepared.motion.likelihood(interval, values)
@@ -235,6 +240,11 @@ def _step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[tupl
         "time_error": in_time,
         "effective_share": updated.effective,
     }
+    outside = prepared.system.base.outside
+    if outside:
+        u = None if interval.inputs is None else interval.inputs.at(interval.stop, prepared.model.input_hold)
+        points, weights = v.cloud(CLOUD)
+        health["outside_tables"] = float(weights[outside(points.T, interval.stop, prepared.theta, u)].sum() / weights.sum())
     lost = max(chain.lost, prediction.defect)
     prepared.recent.train = v
     control = Control(control.interval + 1, time, errors, builder.after())

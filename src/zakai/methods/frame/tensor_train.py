@@ -58,6 +58,7 @@ BOUNDS = {
         1.0, "depth in the tails of the prediction to which an observation leads, divided by the accurate depth. Lower the "
         "tolerance, or compare with guided-particles",
     ),
+    "outside_tables": (1e-3, "share of the mass where a table is constant beyond its range"),
     "off_grid_error": (
         0.05, "share by which the density may be wrong: a part of little mass may be missing, and standard deviations too small. "
         "Raise most_rank, or compare with guided-particles",

@@ -95,8 +95,8 @@ def step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[State
         return _step(prepared, k, state, values)
     except np.linalg.LinAlgError:
         n = prepared.model.n
-        none = np.full(n, np.nan)
-        return state, Info(np.nan, none, np.full((n, n), np.nan), dict.fromkeys(FIGURES, np.nan), none, np.nan)
+        none, figures = np.full(n, np.nan), (*FIGURES, "outside_tables") if prepared.system.outside else FIGURES
+        return state, Info(np.nan, none, np.full((n, n), np.nan), dict.fromkeys(figures, np.nan), none, np.nan)
 
 
 FIGURES = (
