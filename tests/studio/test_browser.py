@@ -126,10 +126,10 @@ def test_an_error_of_the_model_is_shown_at_its_place_while_one_types(page: Page)
 def test_a_long_equation_is_made_smaller_and_seen_whole(page: Page):
     replace(page, 'drift = ["', 'drift = ["(sin(3.25*x) + 2)/(cos(x) + 47) + 3.875*exp(-2.25*x**2) + atan(2.5*x + 0.125) + ')
     expect(page.locator("#equations")).to_contain_text("47")
-    room, widest = page.locator("#equations").evaluate(
+    width, widest = page.locator("#equations").evaluate(
         "box => [box.clientWidth, Math.max(...[...box.querySelectorAll('math')].map((one) => one.getBoundingClientRect().width))]"
     )
-    assert widest <= room
+    assert widest <= width
 
 
 def test_a_model_file_of_the_user_is_opened(page: Page, tmp_path: Path):

@@ -24,7 +24,7 @@ from zakai.numerics.compiled import kernel
 from zakai.numerics.line import window as lw
 from zakai.numerics.line.density import moments, support
 from zakai.numerics.line.grid_choice import DEPTH, MOST_CELLS
-from zakai.numerics.line.resolution import GROSS, RESOLVED
+from zakai.numerics.line.resolution import GROSS, RESOLVED, ROUNDING
 from zakai.numerics.line.steps import LEAST, exponent_added
 
 
@@ -166,6 +166,8 @@ def normalized(density: Array, logs: Array, weights: Array, largest: float) -> t
         result = result / mass
         growth = np.sum(weights * np.exp(np.minimum(logs.real + reference - top - np.log(mass.real), 80.0)))
         depth = np.sum(np.where(result.real > 0, result.real * (reference - own), 0.0))
+        if abs(top) * ROUNDING > 1.0:  # no number compares likelihoods
+            depth = np.inf
     return result, np.log(mass) + top, float(depth), float(growth)
 
 

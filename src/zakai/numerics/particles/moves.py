@@ -92,17 +92,18 @@ PATHS = types.NamedTuple((F2, F2, F2, F1, F2), Paths)
 
 @helper
 def _follow(
-    window: Any, workspace: Any, start: Array, path: Array, x: Array, total: Array, past: Array, seen: Array, size: int
+    window: Any, workspace: Any, start: Array, path: Array, x: Array, totals: Array, seen: Array, size: int
 ) -> None:
-    """Write the states x (rows, size) at the end of a window and the log-likelihoods (size,) of what is observed in it.
+    """Write the states x (rows, size) at the end of a window and the log-likelihoods of what is observed in it.
 
-    `past` (size,) receives those without the last observation, `seen` (n, size) the states at that, before they are updated by
-    it; it may have no rows.
+    `totals` (2, size) receives these, and those without the last observation; `seen` (n, size) the states at that, before they
+    are updated by it; it may have no rows.
     """
     motion, events, observed, prior = window
     blocks, buffers = workspace
     law, times, given, counted = observed
     mean, root = prior
+    total, past = totals[0], totals[1]
     n, rows, places, d0 = start.shape[0], x.shape[0], events[1], root.shape[1]
     for d in range(n):
         for i in range(size):
@@ -196,7 +197,8 @@ def follow(window: Any, start: Array, path: Array, low: int, high: int, out: Arr
     """Write the states (n, N) at the end of a window and the log-likelihoods (N,), for the noise (D, N) from given starts."""
     n, D = start.shape[0], path.shape[0]
     workspace = _workspace(window)
-    x, found, past = np.empty((window.motion[0][3].size, BLOCK)), np.empty(BLOCK), np.empty(BLOCK)
+    x, totals = np.empty((window.motion[0][3].size, BLOCK)), np.empty((2, BLOCK))
+    found = totals[0]
     own, begin = np.empty((D + 1, BLOCK)), np.empty((n, BLOCK))
     for first in range(low, high, BLOCK):
         size = min(BLOCK, high - first)
@@ -206,7 +208,7 @@ def follow(window: Any, start: Array, path: Array, low: int, high: int, out: Arr
         for r in range(D):
             for i in range(size):
                 own[r, i] = path[r, first + i]
-        _follow(window, workspace, begin, own, x, found, past, own[:0], size)
+        _follow(window, workspace, begin, own, x, totals, own[:0], size)
         for d in range(n):
             for i in range(size):
                 out[d, first + i] = x[d, i]
@@ -220,7 +222,8 @@ def propagate(window: Any, even: Any, start: Array, low: int, high: int, after: 
     noise, states, seen, gained = after
     n, D, lost = start.shape[0], noise.shape[0], 0
     workspace = _workspace(window)
-    x, found, past = np.empty((window.motion[0][3].size, BLOCK)), np.empty(BLOCK), np.empty(BLOCK)
+    x, totals = np.empty((window.motion[0][3].size, BLOCK)), np.empty((2, BLOCK))
+    found = totals[0]
     own, begin, at = np.empty((D + 1, BLOCK)), np.empty((n, BLOCK)), np.empty((seen.shape[0], BLOCK))
     for first in range(low, high, BLOCK):
         size = min(BLOCK, high - first)
@@ -228,7 +231,7 @@ def propagate(window: Any, even: Any, start: Array, low: int, high: int, after: 
         for d in range(n):
             for i in range(size):
                 begin[d, i] = start[d, first + i]
-        _follow(window, workspace, begin, own, x, found, past, at, size)
+        _follow(window, workspace, begin, own, x, totals, at, size)
         for r in range(D):
             for i in range(size):
                 noise[r, first + i] = own[r, i]
@@ -318,7 +321,8 @@ def sweep(window: Any, gaussian: Any, control: Array, key: Array, low: int, high
         log_det += math.log(factor)
     workspace = _workspace(window)
     along = np.empty((gaussian[4].size, BLOCK))
-    x, found, past = np.empty((window.motion[0][3].size, BLOCK)), np.empty(BLOCK), np.empty(BLOCK)
+    x, totals = np.empty((window.motion[0][3].size, BLOCK)), np.empty((2, BLOCK))
+    found = totals[0]
     begin, new, fresh, m = np.empty((n, BLOCK)), np.empty((D + 1, BLOCK)), np.empty((D, BLOCK)), np.empty((D, BLOCK))
     w, target = np.empty((D, CHUNK)), np.empty(CHUNK)
     gs, phis, taken = np.empty(BLOCK), np.empty(BLOCK), np.empty(BLOCK, np.bool_)
@@ -348,14 +352,14 @@ def sweep(window: Any, gaussian: Any, control: Array, key: Array, low: int, high
                 for r in range(D if turn >= 0 else 0):
                     for i in range(size):
                         new[r, i] += m[r, i]
-                _follow(window, workspace, begin, new, x, found, past, new[:0], size)
+                _follow(window, workspace, begin, new, x, totals, new[:0], size)
                 _norms(fresh, D, log_det, gs, size)
                 _norms(new, D, 0.0, phis, size)
                 for i in range(size):
                     g, phi = gs[i], phis[i]
                     top = max(g, phi)
                     q = phi if part == 1.0 else top + math.log((1.0 - part) * math.exp(g - top) + part * math.exp(phi - top))
-                    kept = past[i] if alone else 0.0
+                    kept = totals[1, i] if alone else 0.0
                     found[i] = found[i] + phi - q - kept if kept > -np.inf else -np.inf
                     value = kept + power * found[i] + q - g
                     if not value < np.inf:

@@ -78,7 +78,7 @@ export function formulas(target, text) {
   }
   target.replaceChildren(...parsed.body.childNodes);
   for (const formula of target.querySelectorAll("math")) {
-    const room = target.clientWidth / formula.getBoundingClientRect().width;
-    if (room < 1) formula.style.fontSize = `${Math.max(SMALLEST, 0.98 * room) * parseFloat(getComputedStyle(formula).fontSize)}px`;
+    const share = target.clientWidth / formula.getBoundingClientRect().width;
+    if (share < 1) formula.style.fontSize = `${Math.max(SMALLEST, 0.98 * share) * parseFloat(getComputedStyle(formula).fontSize)}px`;
   }
 }
