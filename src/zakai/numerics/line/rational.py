@@ -187,8 +187,12 @@ def _factors(blocks: Array, poles: Array) -> tuple[Array, Array]:
     K, total = poles.size, P * poles.size
     chunks = (total + BATCH - 1) // BATCH
     inner, ends = np.empty((2, chunks, n, n, BATCH)), np.zeros((K, P + 1, 3), np.complex128)
-    ends[:, :, 1] -= poles.reshape(-1, 1)
-    order = np.append(np.arange(1, n - 1), np.array([0, n - 1]))
+    order = np.empty(n, np.int64)
+    for a in range(n):
+        order[a] = a + 1 if a < n - 2 else (0 if a == n - 2 else n - 1)
+    for k in range(K):
+        for q in range(P + 1):
+            ends[k, q, 1] = -poles[k]
     for c in range(chunks):
         re, im = inner[0, c], inner[1, c]
         for entry in range(BATCH):
