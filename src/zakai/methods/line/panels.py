@@ -34,7 +34,7 @@ FIRST_PANELS = 8  # of equal length
 TAIL = 1.0  # allowed errors that a panel may leave unresolved in the coarser of two solutions
 TIGHTER = 0.03  # that where two solutions differ too much, relative to that before
 LEVELS = 3  # pairs of solutions that are compared
-GROSS = 1e-2  # share of the function that a panel leaves unresolved, which shows in all others
+GROSS = 1e-2  # share of the function that a panel leaves unresolved, which shows in all others, and error of no solution
 WORST = 0.03  # of the worst panel: what others leave unresolved that are bisected with it
 ROUNDS = 40  # of bisection
 MOST_PANELS = 500  # beyond which none is bisected
@@ -47,7 +47,6 @@ REACH = 7.0  # standard deviations of the noise beyond the density before, betwe
 DIFFUSED = 0.5  # of the time in which noise would double the variance: the first step
 MOST_STEPS = 1000  # in time, beyond which none is divided
 LEAST_STEP = 1e-9  # of the interval
-SETTLED = 1e-2  # error above which panels do not serve
 
 
 class Problem(NamedTuple):
@@ -362,7 +361,7 @@ def settled(problem: Problem, allowed: float) -> Solution | None:
                 break
             before, limit = error, TIGHTER * limit
             element = element.bisected(parts > 0.5 * allowed / len(parts))
-    return best if best is not None and best.error < SETTLED else None
+    return best if best is not None and best.error < GROSS else None
 
 
 def _differences(problem: Problem, first: Solution, second: Solution) -> Array:

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 from zakai.errors import InputError
-from zakai.methods.line.panels import MOST_PANELS, SIZES, Problem, panels_between, settled
+from zakai.methods.line.panels import MOST_PANELS, ROUNDS, SIZES, Problem, panels_between, settled
 from zakai.methods.line.prepared import Prepared, TimeInterval
 from zakai.methods.line.report import Report
 from zakai.models.domain import Interval
@@ -17,7 +17,6 @@ from zakai.numerics.line.resolution import RESOLVED, TRANSITION_SHARE
 from zakai.numerics.lobatto import Element
 
 SAMPLES = 1001  # points at which the place of a density is sought
-ROUNDS = 24  # of bisection
 
 
 def domain_of(prepared: Prepared) -> Interval:
