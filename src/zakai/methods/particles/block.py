@@ -50,7 +50,7 @@ class Past(NamedTuple):
 
 
 def past_of(window: Window, target: Target) -> Past | None:
-    """Return the last intervals that are taken together with a new one, None where there are none."""
+    """Return the last intervals, at most `LONGEST` with up to `MOST` numbers, None where there are none."""
     count, width = 0, target.events.width
     while count < min(window.length, LONGEST) and width + len(window.noises[window.length - 1 - count]) <= MOST:
         count += 1
