@@ -94,3 +94,25 @@ def test_a_density_that_no_grid_holds_is_lost_and_stays_lost(smooth):
     result = (zakai.smooth if smooth else zakai.filter)(model, record)
     assert any("the density was lost at t = 1" in warning for warning in result.warnings)
     assert smooth or np.isnan(result.mean[1:]).all()
+
+
+def test_a_drift_with_nearly_no_noise_folds_a_prior_into_sharp_fronts():
+    step, observed, q = 0.2, 0.8, 1e-4
+    model = zakai.Model(
+        state=["x"], drift=["-5*x**3"], process_noise=[[q]], observation=["x"], observation_noise=[[0.01]],
+        observation_kind="samples", prior={"kind": "gaussian", "mean": [1.0], "cov": [[0.5]]},
+    )
+    result = zakai.filter(model, zakai.Record([step], [[observed]], "samples"), "yau-yau")
+    assert not result.warnings and result.health["tolerance_ratio"][-1] < 1.0
+    # Each state moves to x / s with s^2 = 1 + 10 t x^2, and its noise has the variance v of v' = -30 v x(t)^2 + q.
+    x = np.linspace(-6.0, 8.0, 40001)
+    s2 = 1 + 10 * step * x**2
+    mean, variance = x / np.sqrt(s2), q * (s2**4 - 1) / (40 * np.where(x == 0, 1, x) ** 2 * s2**3)
+    variance[x == 0] = q * step
+    logs = -((x - 1) ** 2) - 0.5 * (observed - mean) ** 2 / (variance + 0.01) - 0.5 * np.log(variance + 0.01)
+    p = np.exp(logs) / np.exp(logs).sum()
+    centre, left = mean + variance / (variance + 0.01) * (observed - mean), 0.01 * variance / (variance + 0.01)
+    total = p @ centre
+    deviation = np.sqrt(p @ (left + (centre - total) ** 2))
+    assert abs(result.mean[-1, 0] - total) < 1e-3 * deviation
+    assert abs(np.sqrt(result.variance[-1, 0]) / deviation - 1) < 1e-3

@@ -196,6 +196,8 @@ def in_pieces(model: Model) -> bool:
 
 
 MOST_KINKS = 128  # in an interval between which a density is a polynomial
+KINK_PROBES = 1025  # points between which kinks are sought
+ONE_KINK = 1e-10  # distance, of the interval, of the kinks of two coefficients that are one
 _PLACES = 4099  # where roots are sought: distances that differ show those of a period as well
 
 
@@ -283,6 +285,23 @@ class System:
             return [(start, stop)]
         times = [start, *self.inputs.within(start, stop).tolist(), stop]
         return list(zip(times[:-1], times[1:], strict=True))
+
+    def kinks_between(self, lower: float, upper: float, t: float, theta: Array) -> Array:
+        """Return the states between two, in increasing order, where coefficients have kinks or jumps; none if these are many."""
+        if self.kinks is None:
+            return np.zeros(0)
+        x = np.linspace(lower, upper, KINK_PROBES)
+        negative = self.kinks(x[:, None], t, theta) < 0
+        at, which = np.nonzero(negative[1:] != negative[:-1])
+        if len(at) > MOST_KINKS:
+            return np.zeros(0)
+        low, high, left = x[at], x[at + 1], negative[at, which]
+        for _ in range(60):
+            middle = 0.5 * (low + high)
+            same = (self.kinks(middle[:, None], t, theta)[np.arange(len(at)), which] < 0) == left
+            low, high = np.where(same, middle, low), np.where(same, high, middle)
+        found = np.sort(0.5 * (low + high))
+        return found[np.diff(found, prepend=-np.inf) > ONE_KINK * (upper - lower)]
 
     def outside(self, points: Array, t: float, theta: Array) -> Array:
         """Return which points (N,) lead beyond the range of a table."""

@@ -16,7 +16,7 @@ import numpy as np
 from zakai.methods.line.cache import Derived
 from zakai.methods.line.coefficients import coefficients, covariance_at, resolved_parts
 from zakai.methods.line.domain import ends_of_leak, reflecting_ends
-from zakai.methods.line.model import MOST_KINKS, finite, within
+from zakai.methods.line.model import finite, within
 from zakai.methods.line.prepared import Prepared, TimeInterval
 from zakai.methods.line.report import Report
 from zakai.methods.line.transition import Prediction
@@ -33,7 +33,7 @@ SIZES = 9, 13  # points of a panel of two solutions
 FIRST_PANELS = 8  # of equal length
 TAIL = 1.0  # allowed errors that a panel may leave unresolved in the coarser of two solutions
 TIGHTER = 0.03  # that where two solutions differ too much, relative to that before
-LEVELS = 3  # pairs of solutions that are compared
+LEVELS = 5  # pairs of solutions that are compared
 GROSS = 1e-2  # share of the function that a panel leaves unresolved, which shows in all others, and error of no solution
 WORST = 0.03  # of the worst panel: what others leave unresolved that are bisected with it
 ROUNDS = 40  # of bisection
@@ -331,7 +331,7 @@ def settled(problem: Problem, allowed: float) -> Solution | None:
     ends = tuple(np.linspace(problem.low, problem.high, FIRST_PANELS + 1).tolist())
     element, best = _around(problem, np.full(2, problem.reach), ends), None
     for ratio in (0.0, RATIO)[problem.prepared.system.varying :]:
-        limit, before = TAIL * allowed, np.inf
+        limit, before, in_time = TAIL * allowed, np.inf, False
         if problem.backward:
             forward = _ended(problem._replace(message=None), element, ratio, limit)
             if forward is None:
@@ -352,14 +352,22 @@ def settled(problem: Problem, allowed: float) -> Solution | None:
                 best = second._replace(error=error)
             if error < allowed:
                 return best
-            if error > 0.3 * before:
-                break
             if ratio == RATIO:
                 ratio = FINER
                 continue
+            if error > 0.3 * before:  # what was made finer did not matter
+                if in_time or not ratio:
+                    break
+                in_time = True
+            before = error
+            if in_time:
+                ratio **= float(np.clip((allowed / error) ** 0.2, 0.15, 0.5))  # the error is of fifth order
+                if len(_ends_of_steps(problem, ratio)) > MOST_STEPS:
+                    break
+                continue
             if len(parts) > MOST_PANELS:
                 break
-            before, limit = error, TIGHTER * limit
+            limit *= TIGHTER
             element = element.bisected(parts > 0.5 * allowed / len(parts))
     return best if best is not None and best.error < GROSS else None
 
@@ -408,37 +416,15 @@ def _defined(prepared: Prepared, inner: float, outer: float, t: float) -> float:
     return inner
 
 
-KINK_PROBES = 1025  # points between which kinks are sought
-ONE_KINK = 1e-10  # distance, of the interval, of the kinks of two coefficients that are one
-
-
 def kinks_of(prepared: Prepared, lower: float, upper: float, t: float) -> Array:
     """Return the kinks between two states, of those that are known between ends out of few."""
     if prepared.system.kinks is None:
         return np.zeros(0)
     unit, t = 2.0 ** np.ceil(np.log2(upper - lower)), t if prepared.system.varying else prepared.model.start
     low, high = float(unit * np.floor(lower / unit)), float(unit * np.ceil(upper / unit))
-    known: Array = prepared.once(Derived.KINKS, (low, high, t), lambda: kinks_between(prepared, low, high, t))
+    between, theta = prepared.system.kinks_between, prepared.theta.real
+    known: Array = prepared.once(Derived.KINKS, (low, high, t), lambda: between(low, high, t, theta))
     return known[(known > lower) & (known < upper)]
-
-
-def kinks_between(prepared: Prepared, lower: float, upper: float, t: float) -> Array:
-    """Return the states between two, in increasing order, where coefficients have kinks or jumps; none where these are many."""
-    kinks, theta = prepared.system.kinks, prepared.theta.real
-    if kinks is None:
-        return np.zeros(0)
-    x = np.linspace(lower, upper, KINK_PROBES)
-    negative = kinks(x[:, None], t, theta) < 0
-    at, which = np.nonzero(negative[1:] != negative[:-1])
-    if len(at) > MOST_KINKS:
-        return np.zeros(0)
-    low, high, left = x[at], x[at + 1], negative[at, which]
-    for _ in range(60):
-        middle = 0.5 * (low + high)
-        same = (kinks(middle[:, None], t, theta)[np.arange(len(at)), which] < 0) == left
-        low, high = np.where(same, middle, low), np.where(same, high, middle)
-    found = np.sort(0.5 * (low + high))
-    return found[np.diff(found, prepend=-np.inf) > ONE_KINK * (upper - lower)]
 
 
 FAST = 5.0  # ranges of a density that the drift crosses in an interval, below which a uniform grid serves
