@@ -10,7 +10,7 @@ exact for every tau (Daleckii and Krein 1965).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.special import erfc
@@ -23,12 +23,18 @@ from zakai.numerics.line.resolution import ROUNDING
 from zakai.numerics.line.window import CUT, SMALL, Window, density_at, interpolated, local_polynomial
 
 
-class Varied(NamedTuple):
-    """A decomposition, and its derivatives in p directions: of log s (p, N) and of H in the basis of the modes (p, N, N)."""
+@dataclass(eq=False)
+class Varied:
+    """A decomposition, and its derivatives in p directions: of log s (p, N) and of H in the basis of the modes (p, N, N).
+
+    `turned` are those of exp(-tau H) in that basis, of the `length` for which they were computed last.
+    """
 
     modes: Spectral
     scales: Array
     operators: Array
+    length: float = np.nan
+    turned: Array = field(default_factory=lambda: np.zeros(0))
 
     @classmethod
     def of(cls, modes: Spectral, shifted: Sequence[Spectral]) -> Varied:
@@ -71,7 +77,9 @@ class Varied(NamedTuple):
             inner, *rest = np.array([gathered(one, points, own) for one in result]) * _faded(own.size, margin)
             changes = np.array(rest)
         decay, coefficients = np.exp(-length * rates), inner @ U
-        turned = (self.operators * quotients(rates, decay, length)) @ coefficients
+        if length != self.length:
+            self.length, self.turned = length, self.operators * quotients(rates, decay, length)
+        turned = self.turned @ coefficients
         after = U @ (decay * coefficients)
         # Beyond the support there is only rounding, which the scale must not amplify.
         noise = ROUNDING * np.sqrt(np.sum(inner * inner)) * max(1.0, decay[0])
