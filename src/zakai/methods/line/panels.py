@@ -23,6 +23,7 @@ from zakai.methods.line.transition import Prediction
 from zakai.numerics.arrays import Array, Number
 from zakai.numerics.line import window as lw
 from zakai.numerics.line.averages import GAUSS_NODES, Panels, interpolation
+from zakai.numerics.line.grid_choice import FAR
 from zakai.numerics.line.rational import COLLOCATION, CONTRACTION, Factors, collocated, joined, masses, separated, weak_form
 from zakai.numerics.line.resolution import RESOLVED, ROUNDING, SUPPORT, TRANSITION_SHARE
 from zakai.numerics.lobatto import Element
@@ -197,22 +198,30 @@ class Operator:
 JUMP = 1e-5  # relative difference of G on both sides of a cut from which it is a jump
 
 
-def _ends_of_steps(problem: Problem, ratio: float) -> Array:
-    """Return the ends (T + 1,) of steps, longer than the one before by at most a ratio, backward also at the end."""
-    length = problem.interval.length
+class Steps(NamedTuple):
+    """Steps in time: each longer than the one before by at most a `ratio`, or `number` equal ones by an exponential."""
+
+    ratio: float = 0.0
+    number: int = 1
+
+    def finer(self, power: float) -> Steps:
+        """Return steps whose ratio is to a power of at most one half, or twice as many."""
+        return Steps(self.ratio**power, 2 * self.number)
+
+
+def _ends_of_steps(problem: Problem, steps: Steps) -> Array:
+    """Return the ends (T + 1,) of steps; backward they are short at the end, too."""
+    length, ratio = problem.interval.length, steps.ratio
+    if not ratio:
+        return np.linspace(0.0, length, steps.number + 1)
     count = int(np.ceil(np.log(length / problem.quick) / np.log(ratio)))
     ends = length * (problem.quick / length) ** np.linspace(1.0, 0.0, count + 1)
     bounds = [0.0, *(stop for _, stop in problem.parts.bounds)]
     return np.unique(np.concatenate([bounds, ends[:-1], length - ends[:-1] if problem.backward else []]))
 
 
-def _solved(problem: Problem, element: Element, ratio: float, least: int = 1) -> Solution | None:
-    """Return the function after the interval on panels, None where there is none.
-
-    Args:
-        ratio: of the lengths of steps of collocation; zero for exponentials, where no coefficient depends on time.
-        least: the number of exponentials.
-    """
+def _solved(problem: Problem, element: Element, chosen: Steps) -> Solution | None:
+    """Return the function after the interval on panels, None where there is none."""
     operator, backward, length = Operator(problem, element), problem.backward, problem.interval.length
     v = joined(element, element.weights * (problem.message or problem.density)(element.points))
     v = v / joined(element, element.weights) if backward else v
@@ -223,7 +232,7 @@ def _solved(problem: Problem, element: Element, ratio: float, least: int = 1) ->
 
     gained = np.log(size(v) if backward else size(v) / size(v).real)
     v = v / size(v)
-    ends = _ends_of_steps(problem, ratio) if ratio else np.linspace(0.0, length, least + 1)
+    ends = _ends_of_steps(problem, chosen)
     steps, part, factors = list(zip(ends[:-1], ends[1:], strict=True)), (0.0, 0.0), None
     steps = steps if backward else steps[::-1]
     while steps:
@@ -232,7 +241,7 @@ def _solved(problem: Problem, element: Element, ratio: float, least: int = 1) ->
         if not part[0] <= 0.5 * (first + last) <= part[1]:
             part = next(bounds for bounds in problem.parts.bounds if bounds[0] <= 0.5 * (first + last) <= bounds[1])
             blocks = operator.part(*part)
-        if ratio:
+        if chosen.ratio:
             at = last - step * COLLOCATION.nodes if backward else first + step * COLLOCATION.nodes
             found = collocated(element, blocks(at, step), v)
             if found is None:
@@ -281,10 +290,10 @@ def _began(problem: Problem, element: Element, limit: float) -> Element:
     return element
 
 
-def _ended(problem: Problem, element: Element, ratio: float, limit: float) -> Solution | None:
+def _ended(problem: Problem, element: Element, steps: Steps, limit: float) -> Solution | None:
     """Return the solution on panels that hold and resolve the function after the interval, too; None where there is none."""
     for _ in range(ROUNDS):
-        solution = _solved(problem, element, ratio)
+        solution = _solved(problem, element, steps)
         if solution is None:
             return None
         sides = (False, False) if problem.backward else _reached(problem, solution)
@@ -330,18 +339,18 @@ def settled(problem: Problem, allowed: float) -> Solution | None:
     """Return the function after the interval on more panels until two solutions differ by less than allowed, or by the least."""
     ends = tuple(np.linspace(problem.low, problem.high, FIRST_PANELS + 1).tolist())
     element, best = _around(problem, np.full(2, problem.reach), ends), None
-    for ratio in (0.0, RATIO)[problem.prepared.system.varying :]:
+    for steps in (Steps(), Steps(RATIO))[problem.prepared.system.varying :]:
         limit, before, in_time = TAIL * allowed, np.inf, False
         if problem.backward:
-            forward = _ended(problem._replace(message=None), element, ratio, limit)
+            forward = _ended(problem._replace(message=None), element, steps, limit)
             if forward is None:
                 continue
             problem, element = problem._replace(after=forward.at), forward.element
         for _ in range(LEVELS):
-            first = _ended(problem, _began(problem, element, limit), ratio, limit)
+            first = _ended(problem, _began(problem, element, limit), steps, limit)
             if first is None:
                 break
-            second = _solved(problem, first.element._replace(size=SIZES[1]), ratio**0.5, 2)
+            second = _solved(problem, first.element._replace(size=SIZES[1]), steps.finer(0.5))
             if second is None:
                 break
             parts, element = _differences(problem, first, second), first.element
@@ -352,17 +361,17 @@ def settled(problem: Problem, allowed: float) -> Solution | None:
                 best = second._replace(error=error)
             if error < allowed:
                 return best
-            if ratio == RATIO:
-                ratio = FINER
+            if steps.ratio == RATIO:
+                steps = Steps(FINER)
                 continue
             if error > 0.3 * before:  # what was made finer did not matter
-                if in_time or not ratio:
+                if in_time:
                     break
                 in_time = True
             before = error
             if in_time:
-                ratio **= float(np.clip((allowed / error) ** 0.2, 0.15, 0.5))  # the error is of fifth order
-                if len(_ends_of_steps(problem, ratio)) > MOST_STEPS:
+                steps = steps.finer(float(np.clip((allowed / error) ** 0.2, 0.15, 0.5)))  # the error is of fifth order
+                if len(_ends_of_steps(problem, steps)) > MOST_STEPS:
                     break
                 continue
             if len(parts) > MOST_PANELS:
@@ -427,7 +436,6 @@ def kinks_of(prepared: Prepared, lower: float, upper: float, t: float) -> Array:
     return known[(known > lower) & (known < upper)]
 
 
-FAST = 5.0  # ranges of a density that the drift crosses in an interval, below which a uniform grid serves
 TURNING_OF_LARGE_GRID = 300.0  # phase by which the drift turns the shortest wave of a large grid, above which that is not tried
 
 
@@ -453,7 +461,7 @@ def contracted(
     noise = float(np.max(covariance_at(prepared.system, window.points, start, prepared.theta.real)))
     stiff = ROUNDING * 0.5 * (np.pi / window.spacing) ** 2 * noise * length > TRANSITION_SHARE * prepared.tolerance
     stiff = stiff or ends_of_leak(prepared, window, ends - window.origin, start, length) is not None
-    if not (rough(prepared, inside) or fine or stiff or speed * length > FAST * width):
+    if not (rough(prepared, inside) or fine or stiff or speed * length > FAR * width):
         return None
     # Panels do not bring back what the grid does not resolve.
     allowed = TRANSITION_SHARE * max(prepared.tolerance, check.aliasing)
