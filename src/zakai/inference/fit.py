@@ -15,7 +15,7 @@ from zakai.engine.driver import filter as run_filter
 from zakai.engine.driver import planned, with_inputs
 from zakai.engine.likelihood import LogLikelihood, chosen_parameters
 from zakai.errors import InputError
-from zakai.inference.maximum import maximum, with_signs_of
+from zakai.inference.maximum import Likelihood, maximum, with_signs_of
 from zakai.inference.profile import Profile, Quadratic
 from zakai.inference.random_maximum import random_maximum, sentence, usual_values
 from zakai.models._errors import listing
@@ -195,7 +195,7 @@ def fit(
                 announce(len(known), *(count * (1 + len(names)) for count in USUAL))
             return known[key]
 
-        found = maximum(counted, values, box, names, model, function.exists, function.jumps)
+        found = maximum(Likelihood(counted, box, names, model, function.exists, function.jumps), values)
         found = with_signs_of(values, found, counted, box)
     values = found.values
     now = model.with_parameters(**dict(zip(names, values.tolist(), strict=True)))

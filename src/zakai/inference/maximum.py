@@ -32,6 +32,20 @@ SINGULAR = 1e-6  # the smallest eigenvalue of the information scaled to a unit d
 Function = Callable[[np.ndarray], tuple[float, np.ndarray]]  # a value and its gradient (p,)
 
 
+class Likelihood(NamedTuple):
+    """The log-likelihood of the parameters `names` (p,) of a model, with its gradient, in a `box` (p, 2).
+
+    `exists` returns whether it exists at some values; at values close by it may differ by `jumps`.
+    """
+
+    function: Function
+    box: np.ndarray
+    names: tuple[str, ...]
+    model: Model
+    exists: Exists
+    jumps: float = 0.0
+
+
 @dataclass
 class Found:
     """The best values, the log-likelihood and the covariance there, and what is wrong with them.
@@ -169,27 +183,20 @@ def _searched(objective: _Objective, exists: Exists, limits: np.ndarray) -> _Sea
     return _Searched(search, iterations, beyond)
 
 
-def maximum(
-    function: Function,
-    values: np.ndarray,
-    box: np.ndarray,
-    names: tuple[str, ...],
-    model: Model,
-    exists: Exists,
-    jumps: float = 0.0,
-) -> Found:
+def maximum(likelihood: Likelihood, values: np.ndarray) -> Found:
     """Return the maximum of the likelihood from `values`.
 
     Where a parameter has changed its sign or its size by far, which may lead across a pole, a second search keeps the signs, in
     the logarithms of the sizes, and the higher end counts.  Where the search ends at values from which the log-likelihood curves
     upwards, it goes on from the best ones in that direction; where it ends on a plateau, from the best of the values that are
-    larger and smaller than the first ones by up to two decades.  Log-likelihoods of values close by may differ by `jumps`.
+    larger and smaller than the first ones by up to two decades.
     """
-    found = _maximum(function, values, box, names, model, exists, jumps)
+    function, box = likelihood.function, likelihood.box
+    found = _maximum(likelihood, values)
     with np.errstate(divide="ignore", invalid="ignore"):
         moved = np.where(values == 0, 1.0, found.values / values)
     if ((moved < 1.0 / FAR) | (moved > FAR)).any():
-        later = _maximum(function, _by_size(function, values, box), box, names, model, exists, jumps)
+        later = _maximum(likelihood, _by_size(function, values, box))
         known = later.converged or not found.converged  # a plateau far away does not replace a maximum
         if known and later.log_likelihood > found.log_likelihood + LIMIT:
             found = replace(later, iterations=found.iterations + later.iterations)
@@ -197,13 +204,13 @@ def maximum(
         start = _uphill(function, found, box)
         if start is None:
             break
-        later = _maximum(function, start, box, names, model, exists, jumps)
+        later = _maximum(likelihood, start)
         if not later.log_likelihood > found.log_likelihood:
             break
         found = replace(later, iterations=found.iterations + later.iterations)
     start = _beside_plateau(function, found, values, box)
     if start is not None:
-        later = _maximum(function, start, box, names, model, exists, jumps)
+        later = _maximum(likelihood, start)
         if later.log_likelihood > found.log_likelihood + LIMIT:
             found = replace(later, iterations=found.iterations + later.iterations)
     return found
@@ -270,16 +277,9 @@ def _uphill(function: Function, found: Found, box: np.ndarray) -> np.ndarray | N
     return start
 
 
-def _maximum(
-    function: Function,
-    values: np.ndarray,
-    box: np.ndarray,
-    names: tuple[str, ...],
-    model: Model,
-    exists: Exists,
-    jumps: float,
-) -> Found:
+def _maximum(likelihood: Likelihood, values: np.ndarray) -> Found:
     """Return the maximum by L-BFGS-B, and then Newton's steps in the free parameters."""
+    function, box, names, model, exists, jumps = likelihood
     scale = FIRST * np.where(values != 0, np.abs(values), 1.0)
     objective, u = _Objective(function, values, scale, jumps), np.zeros(len(values))
     value, gradient = objective.exact(u)

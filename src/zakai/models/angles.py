@@ -13,7 +13,7 @@ import sympy
 from numpy.typing import NDArray
 
 from zakai.densities._values import wrap
-from zakai.models.families import Family, Gaussian, StudentT
+from zakai.models.families import Family, Gaussian, StudentT, Symmetric
 
 if TYPE_CHECKING:
     from zakai.models.model import Model
@@ -79,28 +79,13 @@ ONE_IMAGE = (
 )
 
 
-class Wrapped:
+class Wrapped(Symmetric):
     """The law of an angle whose difference from its location is a variable of `family` modulo 2 pi."""
 
     def __init__(self, family: Family):
         self._family = family
         self.parameter: str | None = family.parameter
         self.noise, self.support = family.noise, "angles in radians"
-
-    @staticmethod
-    def inside(z: Array) -> Array:
-        """Return where z is a possible value."""
-        return np.isfinite(z)
-
-    @staticmethod
-    def mode(h: Array, s: Array, shape: Array) -> Array:
-        """Return the most probable value."""
-        return h
-
-    @staticmethod
-    def mean(h: Array, s: Array, shape: Array) -> Array:
-        """Return the mean direction."""
-        return h
 
     def log_density(self, z: Array, h: Array, s: Array, shape: Array) -> Array:
         """Return the log density on (-pi, pi]."""

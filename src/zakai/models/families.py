@@ -55,8 +55,8 @@ class Family(Protocol):
         """Return P(Z < z) and P(Z <= z)."""
 
 
-class _Continuous:
-    """A law of any number, symmetric about its location."""
+class Symmetric:
+    """A law of any number, or of angles, symmetric about its location: possible values, most probable one and mean."""
 
     @staticmethod
     def inside(z: Array) -> Array:
@@ -71,7 +71,7 @@ class _Continuous:
         return h
 
 
-class Gaussian(_Continuous):
+class Gaussian(Symmetric):
     """N(h, s)."""
 
     parameter, noise, support = None, True, "numbers"
@@ -92,7 +92,7 @@ class Gaussian(_Continuous):
         return value, value
 
 
-class StudentT(_Continuous):
+class StudentT(Symmetric):
     """Location h, squared scale s, `degrees_of_freedom`."""
 
     parameter, noise, support = "degrees_of_freedom", True, "numbers"
@@ -186,7 +186,7 @@ class Bernoulli:
         return np.where(z > 1, 1.0, np.where(z > 0, 1.0 - h, 0.0)), upto
 
 
-class VonMises(_Continuous):
+class VonMises(Symmetric):
     """An angle with mean direction h and `concentration`; distribution functions count from -pi."""
 
     parameter, noise, support = "concentration", False, "angles in radians"
