@@ -105,7 +105,7 @@ def test_a_result_does_not_depend_on_how_the_time_is_cut_into_pieces(monkeypatch
         (linear("samples"), [1.0], {"seed": -1}, "seed: expected a whole number of at least 0"),
         (linear("samples", drift=["x**3"]), [9.0], {"initial": 5.0}, "drift"),
         (linear("samples", drift=["log(x)"]), [9.0], {"initial": -0.3}, "drift[0] = log(x): log of a negative"),
-        (linear("samples", drift=["1/x"]), [9.0], {"initial": 0.0}, "drift[0] = 1/x: division by zero"),
+        (linear("samples", drift=["1/x"], diffusion=[["0"]]), [9.0], {"initial": 0.0}, "drift[0] = 1/x: division by zero"),
         (linear("samples", observation=["sqrt(x - 9)"]), [9.0], {}, "observation[0] = sqrt(x - 9): square root"),
         (linear("samples", observation_noise=[["1 - t"]]), [2.0], {}, "observation_noise: is not positive definite"),
         (linear("samples", functions=["gamma"], drift=["gamma(x)"]), [2.0], {}, "undetermined"),

@@ -1,8 +1,8 @@
-"""A path of the state and a record of its observations, by the methods of Euler and Milstein within each interval."""
+"""A path of the state and a record of its observations, in substeps of each interval."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -18,7 +18,7 @@ from zakai.models.prior import DensityPrior
 from zakai.records import Inputs, Record, Truth
 from zakai.records.inputs import check_inputs
 from zakai.simulation.density_draw import draw_from_density
-from zakai.simulation.stepper import Stepper, outside_domain
+from zakai.simulation.stepper import Stepper, mean_drift, outside_domain
 from zakai.simulation.substeps import finer_counts, usual_counts
 
 CHUNK = 100_000  # substeps held in memory at once
@@ -35,9 +35,12 @@ def simulate(
 ) -> tuple[Truth, Record]:
     """Simulate a path of the state and a record of its observations.
 
-        x_{j+1} = x_j + f(x_j, t_j) d + g(t_j) Q(t_j)^{1/2} sqrt(d) e_j        e_j ~ N(0, I)
-        y_{j+1} = y_j + h(x_j, t_j) d + S(t_j)^{1/2} sqrt(d) e'_j
+        x_{j+1} = F(x_j + w_j / 2) + w_j / 2,    w_j = g(t_j) Q(t_j)^{1/2} sqrt(d) e_j,    e_j ~ N(0, I)
+        y_{j+1} = y_j + (h(x_j, t_j) + h(x_{j+1}, t_{j+1})) d / 2 + S(t_j)^{1/2} sqrt(d) e'_j
 
+    where F follows x' = f(x, t) over a substep d by the method of Runge and Kutta: this is of second order in d. Where the
+    diffusion depends on the state, or the state lives in a domain, x_{j+1} = F(x_j) + w_j, with Milstein's correction where the
+    noises commute.
     Formulas that contain the observed values receive those of the path. Samples are drawn from the model's observation family. A
     step that would leave a domain with natural ends is halved, with the Brownian bridge between; at reflecting ends the state is
     mirrored.
@@ -48,10 +51,10 @@ def simulate(
             after it).
         seed: an integer (the same seed gives the same record) or a NumPy generator.
         initial: the state (n,) at the start; by default it is drawn from the prior.
-        substeps: Euler steps in each interval. By default 10 in an interval of at most the median length, and proportionally
-            more in a longer one, at most 1,000; 50 where the diffusion depends on the state, with Milstein's correction where
-            the noises commute. Where they are too long for the drift along the path (it is stiff, or an oscillation would grow),
-            the path is drawn again with more, and f d is the change without noise by the method of Runge and Kutta.
+        substeps: steps in each interval, which then are those of Euler and Maruyama, x_{j+1} = x_j + f(x_j, t_j) d + w_j and
+            y_{j+1} = y_j + h(x_j, t_j) d + ... By default 10 of the above in an interval of at most the median length, and
+            proportionally more in a longer one, at most 1,000; 50 where the diffusion depends on the state. Where the drift is
+            too fast for them along the path, it is drawn again with more.
         inputs: the known inputs of the model; a step begins where they jump.
 
     Returns:
@@ -77,8 +80,8 @@ def simulate(
     except (TypeError, ValueError):
         raise InputError(f"seed: expected a whole number of at least 0, got {kind_of(seed)}") from None
     state = _initial_state(model, initial, rng)
-    path = _Path(model, rng, inputs)
-    states, rows = path.whole(state, grid, counts, fixed=substeps is not None)
+    path = _Path(model, rng, inputs, of_euler=substeps is not None)
+    states, rows = path.whole(state, grid, counts)
     values = np.array(states)
     for column, name in enumerate(model.state):
         if name in model.periodic:
@@ -103,17 +106,17 @@ def _with_path(
 class _Path:
     """The equations of one model with fixed parameters, advanced over many intervals at a time."""
 
-    def __init__(self, model: Model, rng: np.random.Generator, inputs: Inputs | None):
+    def __init__(self, model: Model, rng: np.random.Generator, inputs: Inputs | None, of_euler: bool):
         self.model, self.inputs = model, inputs
         # Streams of their own, so that the path does not depend on what is observed, nor either on the chunks.
         self._generators = rng.spawn(3)
         self._state_rng, self._observation_rng, bridge_rng = self._generators
-        self._steep = False  # whether steps of Runge and Kutta are taken
+        self._of_euler = of_euler
         self._theta = model.theta()
         self._drift = program_of(list(model.drift), model, stable=True).scalar(self._theta.tolist())
         self._stepper = None
         if model.domain or checks.depends_on_state(model.diffusion, model):
-            self._stepper = Stepper(model, self._theta, bridge_rng)
+            self._stepper = Stepper(model, self._theta, bridge_rng, of_euler)
         self._observation = numpy_function(model.observation, model)
         matrices = {key: getattr(model, key) for key in checks.COEFFICIENTS}
         self._coefficients = {key: numpy_function(matrix, model, matrix.shape) for key, matrix in matrices.items()}
@@ -123,10 +126,8 @@ class _Path:
         t = times if getattr(self.model, key).has(self.model.t) else times[0]
         return self._coefficients[key](np.zeros(self.model.n), t, self._theta)
 
-    def whole(
-        self, state: np.ndarray, grid: np.ndarray, counts: np.ndarray, fixed: bool
-    ) -> tuple[list[np.ndarray], list[np.ndarray]]:
-        """The states (K + 1) and the observations, in parts; with more steps where they are too long, unless they are `fixed`."""
+    def whole(self, state: np.ndarray, grid: np.ndarray, counts: np.ndarray) -> tuple[list[np.ndarray], list[np.ndarray]]:
+        """The states (K + 1) and the observations, in parts; with more steps where they are too long, but for Euler's."""
         generators = [own.bit_generator.state for own in self._generators]
         for attempt in range(ATTEMPTS):
             states, rows, fault = [state], list[np.ndarray](), None
@@ -138,11 +139,11 @@ class _Path:
             except InputError as wrong:
                 fault = wrong
             finer = None
-            if not fixed and attempt + 1 < ATTEMPTS:
+            if not self._of_euler and attempt + 1 < ATTEMPTS:
                 finer = finer_counts(self.model, grid, np.array(states), counts, self.inputs)
-            if finer is None or (self._steep and (finer == counts).all()):
+            if finer is None or (finer == counts).all():
                 break
-            counts, self._steep = finer, True
+            counts = finer
             for own, known in zip(self._generators, generators, strict=True):
                 own.bit_generator.state = known
         if fault is not None:
@@ -153,7 +154,8 @@ class _Path:
         """The states at the ends of the intervals, (K, n), and the increments or samples there, (K, m)."""
         model, rng = self.model, self._observation_rng
         times, steps, first = self._fine_times(grid, counts)
-        u = None if self.inputs is None else self.inputs.at(times, model.input_hold)
+        # Those of the middle of a step, in which they do not jump.
+        u = None if self.inputs is None else self.inputs.at(times if self._of_euler else times + 0.5 * steps, model.input_hold)
         root = square_root(self._coefficient("process_noise", times))
         noise = self._state_rng.standard_normal((len(times), root.shape[-1]))
         if self._stepper is None:
@@ -179,7 +181,10 @@ class _Path:
             shared = _times(gain @ root, noise)
         own = _times(square_root(S), rng.standard_normal((len(times), model.m)))
         noise = (shared + own) * np.sqrt(steps)[:, None]
-        return ends, np.add.reduceat(self._observe(fine[:-1], times, u) * steps[:, None] + noise, first[:-1])
+        seen = self._observe(fine[:-1], times, u)
+        if not self._of_euler:
+            seen = 0.5 * (seen + self._observe(fine[1:], times + steps, u))
+        return ends, np.add.reduceat(seen * steps[:, None] + noise, first[:-1])
 
     def _fine_times(self, grid: np.ndarray, counts: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """The times and lengths of all substeps, and the place of the first of each interval, with the end."""
@@ -197,12 +202,16 @@ class _Path:
         self, state: np.ndarray, times: np.ndarray, steps: np.ndarray, noise: np.ndarray, u: np.ndarray | None
     ) -> np.ndarray:
         """The states at every substep, (N+1, n); plain floats are faster than arrays of a few numbers."""
-        drift, x = self._fourth_order if self._steep else self._of_euler, state.tolist()
+        drift, x = self._drift, state.tolist()
         fine = [x]
         try:
             inputs = [()] * len(times) if u is None else u.tolist()
             for t, step, shock, own in zip(times.tolist(), steps.tolist(), noise.tolist(), inputs):
-                x = [xi + fi * step + wi for xi, fi, wi in zip(x, drift(x, t, own, step), shock)]
+                if self._of_euler:
+                    x = [xi + fi * step + wi for xi, fi, wi in zip(x, drift(x, t, own), shock)]
+                else:
+                    x = [xi + 0.5 * wi for xi, wi in zip(x, shock)]
+                    x = [xi + fi * step + 0.5 * wi for xi, fi, wi in zip(x, mean_drift(drift, x, t, own, step), shock)]
                 fine.append(x)
         except (ValueError, ArithmeticError):  # no such number, or too large a one; said below
             fine.append([float("nan")] * len(x))
@@ -213,17 +222,6 @@ class _Path:
             own = None if u is None else u[last]
             self._refuse("drift", result[last], times[last], "the state grows beyond double precision", own)
         return result
-
-    def _of_euler(self, x: Sequence[float], t: float, own: Sequence[float], step: float) -> Sequence[float]:
-        return self._drift(x, t, own)
-
-    def _fourth_order(self, x: Sequence[float], t: float, own: Sequence[float], step: float) -> Sequence[float]:
-        """The mean drift over a step without noise, by the method of Runge and Kutta."""
-        a = self._drift(x, t, own)
-        b = self._drift([xi + 0.5 * step * ai for xi, ai in zip(x, a)], t + 0.5 * step, own)
-        c = self._drift([xi + 0.5 * step * bi for xi, bi in zip(x, b)], t + 0.5 * step, own)
-        d = self._drift([xi + step * ci for xi, ci in zip(x, c)], t + step, own)
-        return [(ai + 2.0 * bi + 2.0 * ci + di) / 6.0 for ai, bi, ci, di in zip(a, b, c, d)]
 
     def _observe(self, x: np.ndarray, t: np.ndarray, u: np.ndarray | None) -> np.ndarray:
         values = self._observation(x, t, self._theta, u)

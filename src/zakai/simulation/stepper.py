@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,6 +17,7 @@ if TYPE_CHECKING:
 
 MOST_HALVINGS = 40  # of a step that leaves the domain
 Array = NDArray[Any]
+Drift = Callable[[Sequence[float], float, Any], Sequence[float]]
 
 
 def outside_domain(model: Model, x: Any) -> str | None:
@@ -44,15 +46,25 @@ def milstein_terms(model: Model) -> sympy.Matrix:
     return zero if terms.has(sympy.DiracDelta, sympy.Derivative) else terms
 
 
+def mean_drift(drift: Drift, x: list[float], t: float, u: Any, step: float) -> list[float]:
+    """Return the mean of f (n,) along x' = f(x, t) over a step, by the method of Runge and Kutta."""
+    a = drift(x, t, u)
+    b = drift([xi + 0.5 * step * ai for xi, ai in zip(x, a)], t + 0.5 * step, u)
+    c = drift([xi + 0.5 * step * bi for xi, bi in zip(x, b)], t + 0.5 * step, u)
+    d = drift([xi + step * ci for xi, ci in zip(x, c)], t + step, u)
+    return [(ai + 2.0 * bi + 2.0 * ci + di) / 6.0 for ai, bi, ci, di in zip(a, b, c, d)]
+
+
 class Stepper:
     """The path of one model with fixed parameters, with plain floats, which are faster than arrays of a few numbers."""
 
-    def __init__(self, model: Model, theta: Array, rng: np.random.Generator):
-        self.model, self._rng = model, rng
+    def __init__(self, model: Model, theta: Array, rng: np.random.Generator, of_euler: bool):
+        self.model, self._rng, self._of_euler = model, rng, of_euler
         self._r = model.diffusion.cols
         self._domain = [(model.state.index(name), interval) for name, interval in model.domain.items()]
         formulas = [*model.drift, *model.diffusion, *milstein_terms(model)]
         self._formulas = program_of(formulas, model, stable=True).scalar(theta.tolist())
+        self._drift = program_of(list(model.drift), model, stable=True).scalar(theta.tolist())
 
     def path(self, state: Array, times: Array, steps: Array, roots: Array, noise: Array, u: Array | None) -> Array:
         """Return the states (N + 1, n) at the ends of all steps.
@@ -94,10 +106,10 @@ class Stepper:
         n, r = len(x), self._r
         try:
             values = self._formulas(x, t, u)
-            new = []
+            drift, new = self._mean_drift(values[:n], x, t, step, u), []
             for i in range(n):
                 g, m = values[n + i * r : n + (i + 1) * r], values[n + (n + i) * r : n + (n + i + 1) * r]
-                change = values[i] * step
+                change = drift[i] * step
                 for j in range(r):
                     change += g[j] * dv[j]
                     if m[j]:
@@ -111,6 +123,16 @@ class Stepper:
             elif not interval.lower <= new[i] <= interval.upper:
                 return x, "domain"
         return (new, None) if all(abs(value) < 1e300 for value in new) else (x, "formula")
+
+    def _mean_drift(self, first: list[float], x: list[float], t: float, step: float, u: Any) -> list[float]:
+        """Return the mean drift over a step; `first`, that at its start, where it leads to states at which f has no value."""
+        if self._of_euler:
+            return first
+        try:
+            mean = mean_drift(self._drift, x, t, u, step)
+        except (ValueError, ArithmeticError):
+            return first
+        return mean if all(abs(value) < 1e300 for value in mean) else first
 
     def _refuse(self, x: list[float], t: float, u: Any, fault: str) -> None:
         model, point = self.model, np.array(x)
