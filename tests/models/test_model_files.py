@@ -89,7 +89,7 @@ FAULTS = [
     ("prior", '{kind = "gaussian", mean = [0, 0]}', "cov: missing"),
     ("prior", '{kind = "gaussian", mean = [0, 0], cov = [1, 1], weights = [1]}', "unknown key 'weights'"),
     ("prior", '{kind = "gaussian", mean = [0], cov = [1, 1]}', "mean: expected a list of 2 numbers"),
-    ("prior", '{kind = "gaussian", mean = [0, "1"], cov = [1, 1]}', "mean: entry 2: expected a number"),
+    ("prior", '{kind = "gaussian", mean = [0, "a"], cov = [1, 1]}', "mean: entry 2: expected a number"),
     ("prior", '{kind = "gaussian", mean = [0, true], cov = [1, 1]}', "mean: entry 2: expected a number"),
     ("prior", '{kind = "gaussian", mean = [0, 0], cov = [1, -1]}', "cov: is not positive semidefinite"),
     ("prior", '{kind = "gaussian", mean = [0, 0], cov = [[1, 2], [2, 1]]}', "cov: is not positive semidefinite"),
@@ -309,3 +309,13 @@ def test_one_formula_or_number_is_taken_where_there_is_one_state_or_sensor():
             Model(**two, observation_noise=wrong)
     with pytest.raises(InputError, match="drift: expected a list of 2 formulas"):
         Model(**{**two, "drift": "-x"})
+
+
+def test_a_prior_takes_constant_formulas():
+    keys = dict(state=["x"], drift=["-x"], observation=["x"], observation_kind="samples")
+    model = Model(**keys, prior={"kind": "gaussian", "mean": ["1/4"], "cov": [["0.5**2"]]})
+    assert model.prior.mean.tolist() == [0.25] and model.prior.cov.tolist() == [[0.25]]
+    single = Model(**keys, prior={"kind": "gaussian", "mean": "sqrt(4)", "cov": "0.25"})
+    assert single.prior.mean.tolist() == [2.0] and single.prior.cov.tolist() == [[0.25]]
+    with pytest.raises(InputError, match="prior: mean: entry 1: expected a number, got the text 'x'"):
+        Model(**keys, prior={"kind": "gaussian", "mean": ["x"], "cov": [1.0]})

@@ -95,9 +95,9 @@ def test_a_file_with_dates_is_read_and_written(tmp_path):
 @pytest.mark.parametrize(
     ("row", "unit", "says"),
     [
-        ("2024-13-01,1", "h", "row 3: '2024-13-01' in column 'time' is not a date; write 2024-01-31T12:30, or omit the unit"),
+        ("2024-13-01,1", "h", "row 3: '2024-13-01' in column 'time' is not a date; write it as 2024-01-31 or 2024-01-31T12:30"),
         ("2023-01-01,1", "h", "row 3: the time .* comes after the time 0.0; .* sort the rows"),
-        ("0.5,1", "h", "row 3: '0.5' in column 'time' is not a date"),
+        ("0.5,1", "h", "row 3: '0.5' in column 'time' is not a date; .* omit the unit"),
         ("2024-02-01,1", None, "row 2: '2024-01-01' in column 'time' is not a number; for dates give .* --unit h"),
         ("2024-02-01,1", "month", "unit is 'month'; it must be one of ns, us, ms, s, min, h, d, week, year"),
     ],
@@ -115,7 +115,7 @@ def test_a_file_with_a_wrong_date_is_refused_in_one_line(tmp_path, row, unit, sa
         (DATES, {}, "times are dates; give the unit of the model's time, as in unit='h'"),
         (DATES - DATES[0], {}, "times are durations; give the unit"),
         (np.arange(6.0), {"unit": "h"}, "times are numbers; give dates, or both unit and origin"),
-        (DATES, {"unit": "hours"}, "unit is 'hours'; it must be one of ns"),
+        (DATES, {"unit": "fortnight"}, "unit is 'fortnight'; it must be one of ns"),
         (DATES, {"unit": "h", "origin": "soon"}, "origin is 'soon'; give the date at which t = 0"),
         ([*DATES[:5], pandas.NaT], {"unit": "h"}, "row 5, counted from 0: the time is missing"),
     ],
@@ -179,7 +179,7 @@ def test_inputs_in_a_file_have_the_dates_of_the_record(tmp_path, monkeypatch):
     ("make", "says"),
     [
         (lambda: zakai.Inputs(DATES, VALUES), "inputs: times are dates; give the unit"),
-        (lambda: zakai.Inputs(DATES, VALUES, unit="hours"), "inputs: unit is 'hours'"),
+        (lambda: zakai.Inputs(DATES, VALUES, unit="fortnight"), "inputs: unit is 'fortnight'"),
         (lambda: zakai.Record([0.0], [1.0], "samples", zakai.Inputs(DATES[:1], [1.0], unit="h")), "give dates, a unit"),
         (lambda: zakai.online(walk(), unit="h"), "online: give both the unit"),
         (lambda: zakai.online(walk(), unit="h", origin="soon"), "online: origin is 'soon'"),

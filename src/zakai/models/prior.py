@@ -15,6 +15,7 @@ from zakai.errors import InputError
 from zakai.models._definite import ROUNDING, is_symmetric, smallest_eigenvalue, square_root
 from zakai.models._entries import array, formula, items, kind_of, known_keys
 from zakai.models._errors import did_you_mean, listing, named
+from zakai.models.formulas import parse_expression
 from zakai.models.grid_prior import read_grid, read_interval
 
 
@@ -212,17 +213,30 @@ def _read_mixture(keys: Mapping[str, Any], n: int) -> MixturePrior:
 
 
 def _numbers(value: Any, shape: tuple[int, ...], expected: str) -> np.ndarray:
-    """`array` of numbers that a filter can square."""
-    numbers = array(value, shape, expected)
+    """`array` of numbers that a filter can square, of which some may be constant formulas such as "0.02**2"."""
+    numbers = array(_constants(value), shape, expected)
     if numbers.size and np.abs(numbers).max() > LARGEST:
         largest = numbers.flat[np.abs(numbers).argmax()]
         raise InputError(f"expected numbers of at most {LARGEST:g} in size, got {largest:g}")
     return numbers
 
 
+def _constants(value: Any) -> Any:
+    """Return nested lists with the values of constant formulas; other texts stay."""
+    if isinstance(value, list | tuple):
+        return [_constants(entry) for entry in value]
+    if not isinstance(value, str):
+        return value
+    try:
+        constant = parse_expression(value, {})
+    except InputError:
+        return value
+    return float(constant) if constant.is_number and constant.is_real else value
+
+
 def _listed(value: Any, n: int) -> Any:
     """Return one number of one state as a list."""
-    return [value] if n == 1 and isinstance(value, int | float | np.number) and not isinstance(value, bool) else value
+    return [value] if n == 1 and isinstance(value, int | float | str | np.number) and not isinstance(value, bool) else value
 
 
 def _read_covariance(value: Any, n: int) -> np.ndarray:

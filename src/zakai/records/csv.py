@@ -124,6 +124,15 @@ def _inputs_of(path: Path, model: Any, row: int, times: np.ndarray, values: np.n
     return Inputs(times, values)
 
 
+def _advice(cell: str) -> str:
+    """Return what to do about a time that is not an ISO date."""
+    try:
+        float(cell)
+    except ValueError:
+        return "write it as 2024-01-31 or 2024-01-31T12:30"
+    return "write it as 2024-01-31T12:30, or omit the unit"
+
+
 class Dates:
     """ISO dates of a file as times, in a unit from an origin, which is the first date unless it is given."""
 
@@ -139,7 +148,7 @@ class Dates:
         for number, (cell, _, rest) in enumerate(cells, part.number):
             found.append(date_of(cell.strip().strip('"')) if cell.strip() or rest else np.datetime64("NaT", "ns"))
             if found[-1] is None:
-                wrong = number, f"{quoted(cell)} in column 'time' is not a date; write 2024-01-31T12:30, or omit the unit"
+                wrong = number, f"{quoted(cell)} in column 'time' is not a date; {_advice(cell)}"
                 found.pop()
                 break
         dates = np.array(found, "datetime64[ns]")

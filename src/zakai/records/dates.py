@@ -24,7 +24,10 @@ _NANOSECONDS = {
     "week": 7 * 86400 * _SECOND,
     "year": 31557600 * _SECOND,  # 365.25 days
 }
-_OTHER_NAMES = {"D": "d", "H": "h", "W": "week", "Y": "year", "day": "d", "hour": "h", "minute": "min", "second": "s"}
+_OTHER_NAMES = {
+    "D": "d", "H": "h", "W": "week", "Y": "year", "day": "d", "hour": "h", "minute": "min", "second": "s", "sec": "s",
+    "years": "year", "weeks": "week", "days": "d", "hours": "h", "hr": "h", "minutes": "min", "seconds": "s",
+}  # fmt: skip
 
 
 _TIME = re.compile(r"\bt = ([-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?)(?![\d*/])")
