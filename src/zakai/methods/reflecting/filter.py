@@ -38,11 +38,12 @@ from zakai.models.prior import DensityPrior, Prior
 from zakai.numerics.arrays import Array, Number
 from zakai.numerics.line.grid_choice import DEPTH
 from zakai.numerics.line.product import General, Likelihood, normalized, place
-from zakai.numerics.line.resolution import NOISE
 from zakai.numerics.lobatto import Element
 from zakai.numerics.prior_grid import mixture_log_density, prior_grid
 
+NOISE = 4e-14  # error of a prediction relative to its maximum: that of the rational exponential
 DEPTH_OF_PRODUCT = 70.0  # logarithm of the density below its maximum, from which a product does not come
+
 
 class State(NamedTuple):
     """The probabilities (N,) of the Gauss-Lobatto points between `lower`, `cuts` (C,) and `upper`; an estimate of their error."""
@@ -119,7 +120,8 @@ def _multiplied(
     prepared: Prepared, values: Array, element: Element, likelihood: Likelihood, report: Report, negligible: float
 ) -> tuple[Array, Element, Number]:
     """Return the product with a likelihood, its points, and the logarithm of its mass."""
-    domain, largest = domain_of(prepared), float(np.max((values / element.weights).real))
+    # The maximum of a Gaussian with this integral of its square: at an end a density may have none.
+    domain, largest = domain_of(prepared), 2.0**0.5 * float(np.sum(values.real**2 / element.weights))
 
     def product(points: Element) -> tuple[Array, Number, float, float]:
         density = values / element.weights if points == element else element.at(values, points.points)
@@ -161,7 +163,8 @@ def _step(prepared: Prepared, k: int, state: State, observed: np.ndarray) -> tup
     if length > 0:
         interval = prepared.interval(k, inside, observed)
         values, element, gained = propagated(prepared, values, element, interval, report, negligible)
-    predicted, floor = moments(values, element), NOISE + report.aliasing + report.edge
+    # What panels leave unresolved stays where it is, and counts again in the product.
+    predicted, floor = moments(values, element), NOISE + report.edge
     at_end = schedule.seen[k] & ~inside
     if at_end.any():
         likelihood = factor_at_end(prepared, k, at_end, observed, element)
