@@ -242,8 +242,10 @@ def test_a_mirrored_system_gives_the_mirrored_density_and_a_batch_what_each_give
     records = [zakai.simulate(model, np.arange(1, 13) * 0.1, seed=seed)[1] for seed in (1, 2)]
     result = zakai.filter(model, records[0], "general-direct")
     other = zakai.filter(mirrored, records[0], "general-direct")
-    assert np.allclose(result.mean, -other.mean, atol=1e-6) and np.allclose(result.variance, other.variance, atol=1e-6)
-    assert result.log_likelihood == pytest.approx(other.log_likelihood, abs=1e-6)
+    # Which Gaussian is split first is a matter of rounding, and shows far below what is reported.
+    slight = 0.1 * np.nanmax(result.health["mean_error"])
+    assert np.allclose(result.mean, -other.mean, atol=slight) and np.allclose(result.variance, other.variance, atol=slight)
+    assert result.log_likelihood == pytest.approx(other.log_likelihood, abs=0.1 * np.nanmax(result.health["evidence_error"]))
     many = zakai.filter(model, records, "general-direct")
     assert np.allclose(many[0].mean, result.mean, atol=1e-9)
     assert many[0].log_likelihood == pytest.approx(result.log_likelihood, abs=1e-9)

@@ -38,6 +38,30 @@ def test_a_long_path_has_the_moments_of_the_linear_theory():
     assert (x[1:] * x[:-1]).mean() / x.var() == pytest.approx(np.exp(-0.5), abs=0.05)
 
 
+def test_steps_of_a_path_follow_the_drift_over_long_intervals():
+    # Without noise to speak of: an oscillator, and an unstable state that grows by e^8.
+    keys = dict(observation_noise=[["1e-12"]], observation_kind="samples")
+    oscillator = Model(state=["q", "p"], drift=["p", "-q"], diffusion=[["0"], ["1e-9"]], observation=["q"],
+                       prior={"kind": "gaussian", "mean": [1, 0], "cov": [0, 0]}, **keys)  # fmt: skip
+    unstable = Model(state=["x"], drift=["2*x"], diffusion=[["1e-9"]], observation=["x"],
+                     prior={"kind": "gaussian", "mean": [1], "cov": [0]}, **keys)  # fmt: skip
+    for length in (1.0, 4.0):
+        path = simulate(oscillator, length * np.arange(1, 4), seed=1)[0].values[1:, 0]
+        np.testing.assert_allclose(path, np.cos(length * np.arange(1, 4)), atol=1e-3)
+        grown = simulate(unstable, [length], seed=1)[0].values[-1, 0]
+        assert grown == pytest.approx(np.exp(2 * length), rel=1e-3)
+
+
+def test_noise_within_a_step_has_the_covariance_of_the_linear_theory():
+    model = linear("samples", drift=["-3*x"], prior={"kind": "gaussian", "mean": [0.0], "cov": [0.0]})
+    truth, _ = simulate(model, np.arange(1, 40_001) * 0.5, seed=0)
+    assert truth.values[100:, 0].var() == pytest.approx(1 / 6, rel=0.02)  # Euler's steps have 8 % more
+    integral = linear("increments", drift=["0"], diffusion=[["1"]], observation=["x"], observation_noise=[["1e-12"]])
+    truth, record = simulate(integral, [1.0] * np.arange(1, 2001), seed=0)
+    trapezoid = record.values[:, 0] - 0.5 * (truth.values[1:, 0] + truth.values[:-1, 0])
+    assert abs(trapezoid.mean()) < 0.03  # Euler's sum of left values is a tenth behind
+
+
 def test_correlated_noise_enters_the_state_with_g_q_g():
     model = Model(state=["x", "v"], drift=["0", "0"], observation=["x"], diffusion=[["1", "0"], ["1", "2"]],
                   process_noise=[["1", "0.5"], ["0.5", "1 + t"]])  # fmt: skip

@@ -148,7 +148,7 @@ def test_without_process_noise_the_copies_are_counted_as_one():
     model = zakai.Model(observation_kind="samples", **(SPIRAL | {"process_noise": [["0"]]}))
     record = record_of(model, np.arange(1, 81) / 4)
     result = zakai.filter(model, record, "particle", **FEW["particle"])
-    assert result.health["effective_sample_size"][-1] <= len(np.unique(result.density(-1).points)) < 20
+    assert result.health["effective_sample_size"][-1] < len(np.unique(result.density(-1).points)) + 1e-9 < 20
     assert any("no process noise" in said for said in result.warnings)
     assert any("few particles carry the weight" in said for said in result.warnings)
 

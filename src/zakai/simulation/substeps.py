@@ -11,7 +11,7 @@ from zakai.numerics.arrays import Array
 from zakai.records import Inputs
 
 SUBSTEPS, SUBSTEPS_OF_STATE_DEPENDENT_NOISE, MOST = 10, 50, 1000  # of an interval of median length, and of one at most
-STEEP = 0.5  # |l| d above which steps are too long
+STEEP = 0.25  # |l| d above which steps are too long
 FINE, MOST_FINE = 0.2, 20_000  # |l| d of shorter ones, and the most of them in an interval
 LOOKED_AT = 500  # states of a path at which the drift is differentiated
 _STEP = 1e-6  # of the differences, relative to a state
