@@ -123,3 +123,23 @@ def test_a_tensor_train_of_many_substeps_is_left():
 @pytest.mark.parametrize("method", ["yau-yau", "tensor-train"])
 def test_a_method_that_is_named_is_taken(method):
     assert zakai.filter(oscillator(2), record_of(0.01, 1), method, keep="moments").method == method
+
+
+def test_auto_takes_another_method_where_one_loses_the_density_later():
+    # A cell with a fast voltage that follows a current in steps: the grid loses it where the current ends, long after the start.
+    rng = np.random.default_rng(3)
+    times = np.cumsum(rng.choice([2, 5, 10, 30], 60)) / 60.0
+    current = np.where(rng.random(61) < 0.7, rng.uniform(0, 0.12, 61), 0)
+    model = zakai.Model(
+        state=["charge", "voltage"], drift=["-I/2.5", "60*I - 60*voltage/0.9"], diffusion=[["0.01", "0"], ["0", "0.02"]],
+        observation=["3.2 + 0.55*charge + 0.25*exp(-20*(1 - charge)) - 0.35*exp(-15*charge) - 0.05*voltage"], inputs=["I"],
+        observation_noise=[["0.012**2"]], observation_kind="samples",
+        prior={"kind": "gaussian", "mean": [0.7, 0], "cov": [0.03, 0.01]},
+    )  # fmt: skip
+    inputs = zakai.Inputs(np.append(0.0, times), current[:, None])
+    record = zakai.simulate(model, times[:22], seed=5, inputs=inputs, initial=[0.82, 0])[1]
+    assert any("the density was lost" in sentence for sentence in zakai.filter(model, record, "yau-yau").warnings)
+    result, other = zakai.filter(model, record), zakai.filter(model, record, "tensor-train")
+    assert result.method != "yau-yau" and "yau-yau holds too, but loses the density at t = 2.8" in result.why
+    assert not result.warnings
+    assert (np.abs(result.mean - other.mean) < 0.02 * np.sqrt(other.variance)).all()

@@ -10,7 +10,7 @@ import numpy as np
 
 from zakai._progress import Progress, announced
 from zakai.engine.batch import filter_all
-from zakai.engine.first_intervals import first_intervals
+from zakai.engine.first_intervals import any_fault, first_intervals
 from zakai.engine.loop import KEPT_BYTES
 from zakai.engine.plan import Plan, plan_of
 from zakai.engine.results import FilterResult
@@ -133,7 +133,35 @@ def _filter(
         plans.append(found[key])
     check_noise(found.values(), records)
     results = filter_planned(plans, records, keep, progress)
+    if method == "auto":
+        for index, (plan, own, one) in enumerate(zip(plans, priors, records, strict=True)):
+            other = _instead(plan, own, one, results[index])
+            if other is not None:
+                again = filter_planned([other], [one], keep, progress)[0]
+                results[index] = again if _lost(other, again) is None else results[index]
     return results if many else results[0]
+
+
+def _instead(plan: Plan, prior: Prior | None, record: Record, result: FilterResult) -> Plan | None:
+    """Return what "auto" takes for several coupled states where a method has lost their density, None where nothing is left."""
+    time, name = _lost(plan, result), plan.method
+    if time is None or plan.model.n == 1 or plan.division is not None:
+        return None
+
+    def lost(setting: Setting) -> str:
+        return f"loses the density at t = {time:.12g}" if setting.method.name == name else ""
+
+    _, options = plan.request
+    other = planned(plan.model, prior, "auto", options, unfit=any_fault(lost, first_intervals(plan.model, record).fault))
+    return None if other.method == name else other
+
+
+def _lost(plan: Plan, result: FilterResult) -> float | None:
+    """Return when a density was lost, None where it was not."""
+    gone = ~(np.isfinite(result.log_likelihood_increments) & np.isfinite(result.mean).all(axis=1))
+    for name, limit in plan.settings[0].method.losses.items():
+        gone |= np.nan_to_num(result.health[name], nan=0.0) > limit if name in result.health else False
+    return float(result.times[np.argmax(gone)]) if gone.any() else None
 
 
 def filter_planned(
