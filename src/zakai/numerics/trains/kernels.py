@@ -340,24 +340,28 @@ def draw(packed: Any, right: Array, share: Array, flat: bool, out: Array) -> Non
     width, longest = 1, 1
     for k in range(n):
         width, longest = max(width, ranks[k + 1]), max(longest, sizes[k])
-    v, next_v, w, root = np.empty(width), np.empty(width), np.empty(longest), np.empty(longest)
+    v, next_v, laws, roots, sums = np.empty(width), np.empty(width), np.empty((n, longest)), np.empty((n, longest)), np.empty((n, 2))
     for p in range(count):
         v[0] = 1.0
         likely, drawn, at_right = 1.0, 1.0, 0
         for k in range(n):
             a, b, N = ranks[k], ranks[k + 1], sizes[k]
-            total, root_total = 0.0, 0.0
-            w[:N] = 0.0
-            for q in range(a):
-                factor, row = v[q], right[at_right + q * N : at_right + (q + 1) * N]
+            w, root = laws[k], roots[k]
+            if p == 0 or k > 0:  # the law on the first axis is that of all draws
+                total, root_total = 0.0, 0.0
+                w[:N] = 0.0
+                for q in range(a):
+                    factor, row = v[q], right[at_right + q * N : at_right + (q + 1) * N]
+                    for i in range(N):
+                        w[i] += factor * row[i]
                 for i in range(N):
-                    w[i] += factor * row[i]
-            for i in range(N):
-                w[i] = max(w[i], 0.0)
-                root[i] = math.sqrt(w[i])
-            for i in range(N):
-                total += w[i]
-                root_total += root[i]
+                    w[i] = max(w[i], 0.0)
+                    root[i] = math.sqrt(w[i])
+                for i in range(N):
+                    total += w[i]
+                    root_total += root[i]
+                sums[k, 0], sums[k, 1] = total, root_total
+            total, root_total = sums[k]
             at_right += N * a
             chosen, chosen_total = (root, root_total) if flat else (w, total)
             u, j, before = share[k, p] * chosen_total, 0, 0.0
