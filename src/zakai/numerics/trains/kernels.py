@@ -245,11 +245,12 @@ def skeleton(A: Array, tolerance: float, scaling: Any, most: int, rows: Array, c
     _to_factors(of_row, scaling[0], scaling[1])
     _to_factors(of_column, scaling[0], scaling[1])
     for q in range(b):
-        norms[q] = 0.0
+        column, size = rest[q], 0.0
         for p in range(m):
-            rest[q, p] = A[p, q] * of_row[p] * of_column[q]
-            norms[q] += rest[q, p] * rest[q, p]
-        total += norms[q]
+            column[p] = A[p, q] * of_row[p] * of_column[q]
+            size += column[p] * column[p]
+        norms[q] = size
+        total += size
     r = 0
     while r < most:
         left, best = 0.0, 0
@@ -374,8 +375,9 @@ def draw(packed: Any, right: Array, share: Array, flat: bool, out: Array) -> Non
             next_v[:b] = 0.0
             for s in range(a):
                 base, factor = offsets[k] + (j * a + s) * b, v[s]
+                row = cores[base : base + b]
                 for q in range(b):
-                    next_v[q] += factor * cores[base + q]
+                    next_v[q] += factor * row[q]
             top = 0.0
             for q in range(b):
                 top = max(top, abs(next_v[q]))
@@ -401,8 +403,9 @@ def values_on_grid(packed: Any, index: Array, out: Array) -> None:
             base = offsets[k] + index[p, k] * a * b
             next_v[:b] = 0.0
             for s in range(a):
+                factor, row = v[s], cores[base + s * b : base + (s + 1) * b]
                 for q in range(b):
-                    next_v[q] += v[s] * cores[base + s * b + q]
+                    next_v[q] += factor * row[q]
             for q in range(b):
                 v[q] = next_v[q]
         out[p] = v[0]
