@@ -113,11 +113,20 @@ class Mass:
         """Return the points with angles (n,) on the turn about their mean direction, so that moments are those of a line."""
         if not angles.any():
             return self
+        known = self._unwrapped.get(angles.tobytes())
+        if known is not None:
+            return known
         points = self.points.copy()
         for d in np.flatnonzero(angles):
             c = math.atan2(np.sin(points[d]) @ self.weights, np.cos(points[d]) @ self.weights)
             points[d] = c + np.remainder(points[d] - c + math.pi, 2 * math.pi) - math.pi
-        return Mass(points, self.weights)
+        found = self._unwrapped[angles.tobytes()] = Mass(points, self.weights)
+        return found
+
+    @cached_property
+    def _unwrapped(self) -> dict[bytes, Mass]:
+        """The points on one turn, by which states are angles."""
+        return {}
 
     @cached_property
     def distances(self) -> Array:

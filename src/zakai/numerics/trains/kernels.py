@@ -341,7 +341,8 @@ def draw(packed: Any, right: Array, share: Array, flat: bool, out: Array) -> Non
     width, longest = 1, 1
     for k in range(n):
         width, longest = max(width, ranks[k + 1]), max(longest, sizes[k])
-    v, next_v, laws, roots, sums = np.empty(width), np.empty(width), np.empty((n, longest)), np.empty((n, longest)), np.empty((n, 2))
+    v, next_v, sums = np.empty(width), np.empty(width), np.empty((n, 2))
+    laws, roots = np.empty((n, longest)), np.empty((n, longest))
     for p in range(count):
         v[0] = 1.0
         likely, drawn, at_right = 1.0, 1.0, 0
