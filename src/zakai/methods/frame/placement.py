@@ -61,7 +61,7 @@ class Mass:
     def slope(self, ends: Array) -> Array:
         """Return the matrix (n, n) of the linear regression of other points (n, P), with the same weights, on these."""
         mean, P = self.moments()
-        scale = np.maximum(np.sqrt(np.diag(P)), 1e-300)
+        scale = np.maximum(np.sqrt(P.diagonal()), 1e-300)
         apart = (self.points - mean[:, None]) / scale[:, None]
         moved = ends - (ends @ self.weights)[:, None]
         unit = P / np.outer(scale, scale) + 1e-9 * np.eye(len(P))
@@ -98,26 +98,41 @@ class Mass:
 
     def heavy(self, tolerance: float) -> Array:
         """Return which points (P,) cannot be left out: the others have together a small share of the mass."""
-        order = np.argsort(self.weights, kind="stable")
+        order, below = self._ascending
         keep = np.ones(len(order), bool)
-        keep[order[np.cumsum(self.weights[order]) < LEFT_OUT * tolerance]] = False
+        keep[order[below < LEFT_OUT * tolerance]] = False
         return keep
+
+    @cached_property
+    def _ascending(self) -> tuple[Array, Array]:
+        """The points (P,) in the order of their weights, and the sums of the weights up to each."""
+        order = np.argsort(self.weights, kind="stable")
+        return order, np.cumsum(self.weights[order])
 
     def unwrapped(self, angles: Array) -> Mass:
         """Return the points with angles (n,) on the turn about their mean direction, so that moments are those of a line."""
         if not angles.any():
             return self
+        known = self._unwrapped.get(angles.tobytes())
+        if known is not None:
+            return known
         points = self.points.copy()
         for d in np.flatnonzero(angles):
             c = math.atan2(np.sin(points[d]) @ self.weights, np.cos(points[d]) @ self.weights)
             points[d] = c + np.remainder(points[d] - c + math.pi, 2 * math.pi) - math.pi
-        return Mass(points, self.weights)
+        found = self._unwrapped[angles.tobytes()] = Mass(points, self.weights)
+        return found
+
+    @cached_property
+    def _unwrapped(self) -> dict[bytes, Mass]:
+        """The points on one turn, by which states are angles."""
+        return {}
 
     @cached_property
     def distances(self) -> Array:
         """The distances (P,) from the mean in deviations, those of a Gaussian about one."""
         mean, P = self.moments()
-        scale = np.maximum(np.sqrt(np.diag(P)), 1e-300)
+        scale = np.maximum(np.sqrt(P.diagonal()), 1e-300)
         apart = (self.points - mean[:, None]) / scale[:, None]
         unit = P / np.outer(scale, scale) + 1e-9 * np.eye(len(P))
         return np.asarray(np.sqrt(np.sum(apart * (np.linalg.inv(unit) @ apart), axis=0) / len(P)))
@@ -162,7 +177,7 @@ def frame_of(P: Array, Q: Array | None, together: float) -> tuple[Array, Array]:
 
     Axes whose noise differs by less than `together` form a group, inside of which B is triangular.
     """
-    d, n = np.sqrt(np.maximum(np.diag(P), 1e-300)), len(P)
+    d, n = np.sqrt(np.maximum(P.diagonal(), 1e-300)), len(P)
     C = d[:, None] * np.linalg.cholesky(P / d / d[:, None] + 1e-9 * np.eye(n))
     if Q is None:
         return C, np.zeros((n, n))
@@ -173,9 +188,12 @@ def frame_of(P: Array, Q: Array | None, together: float) -> tuple[Array, Array]:
         if stop < n and noise[stop] - noise[stop - 1] < together * (1 + noise[stop]):
             continue
         group = W[:, start:stop]
-        rows = sorted(sorted(free, key=lambda i: -np.sum(group[i] ** 2))[: stop - start])
-        q, r = np.linalg.qr(group[rows].T)  # group[rows] = r' q': the group times q is triangular there
-        V[:, rows] = group @ (q * np.where(np.diag(r) < 0, -1.0, 1.0))
+        sizes = (group**2).sum(axis=1)
+        rows = sorted(sorted(free, key=lambda i: -sizes[i])[: stop - start])
+        q, r = np.eye(1), group[rows].T
+        if len(rows) > 1:
+            q, r = np.linalg.qr(r)  # group[rows] = r' q': the group times q is triangular there
+        V[:, rows] = group @ (q * np.where(r.diagonal() < 0, -1.0, 1.0))
         free, start = [i for i in free if i not in rows], stop
     return C @ V, V.T @ T @ V
 
@@ -185,7 +203,7 @@ def without_chance(P: Array, count: float) -> Array:
 
     With chance correlations in its frame, a density of 2^6 modes on the axes has twenty times the ranks.
     """
-    d = np.sqrt(np.maximum(np.diag(P), 1e-300))
+    d = np.sqrt(np.maximum(P.diagonal(), 1e-300))
     linked = np.abs(P / d / d[:, None]) >= CHANCE / math.sqrt(count)
     for _ in range(len(P)):  # paths of any length
         linked = linked @ linked
@@ -198,7 +216,7 @@ def closed_axes(mass: Mass, angles: Array, rule: Rule) -> Array:
         return np.zeros(len(angles), bool)
     mean, P = mass.moments()
     far = np.abs(mass.points - mean[:, None])[:, mass.heavy(rule.tolerance)].max(axis=1)
-    reach = np.maximum(rule.width * np.sqrt(np.diag(P)), REACH * far)
+    reach = np.maximum(rule.width * np.sqrt(P.diagonal()), REACH * far)
     return np.asarray(angles & (reach > HALF_TURN * 2 * np.pi))
 
 

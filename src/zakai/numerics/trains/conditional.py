@@ -80,8 +80,9 @@ def draw_before(train: Any, closed: Array, deviations: Array, y: Array, share: A
                 summed[k, j] = 0.0
                 for i in range(a):
                     base, t = offsets[k] + (j * a + i) * b, 0.0
+                    core = flat[base : base + b]
                     for q in range(b):
-                        t += right[q] * flat[base + q]
+                        t += right[q] * core[q]
                     carried[j, i] = t
             ends[k, 0], ends[k, 1] = lowest, highest
             top = 0.0
@@ -127,9 +128,10 @@ def draw_before(train: Any, closed: Array, deviations: Array, y: Array, share: A
             total = mass = moment = 0.0
             for node in range(nodes[k]):
                 t = u = 0.0
+                row = rows[k, node]
                 for i in range(a):
-                    t += v[i] * rows[k, node, i]
-                    u += left[i] * rows[k, node, i]
+                    t += v[i] * row[i]
+                    u += left[i] * row[i]
                 t, u = max(t, 0.0), max(u, 0.0)
                 weights[k, node] = t
                 total += t
@@ -152,8 +154,9 @@ def draw_before(train: Any, closed: Array, deviations: Array, y: Array, share: A
             for d in range(6):
                 for i in range(a):
                     base, factor = offsets[k] + ((j - 2 + PAD + d) * a + i) * b, w[d] * v[i]
+                    core = flat[base : base + b]
                     for q in range(b):
-                        right[q] += factor * flat[base + q]
+                        right[q] += factor * core[q]
             for q in range(b):
                 top = max(top, abs(right[q]))
             for q in range(b):
@@ -164,8 +167,9 @@ def draw_before(train: Any, closed: Array, deviations: Array, y: Array, share: A
                 if summed[k, j] != 0.0:
                     for i in range(a):
                         base, factor = offsets[k] + (j * a + i) * b, summed[k, j] * left[i]
+                        core = flat[base : base + b]
                         for q in range(b):
-                            right[q] += factor * flat[base + q]
+                            right[q] += factor * core[q]
             for q in range(b):
                 top = max(top, abs(right[q]))
             for q in range(b):

@@ -155,7 +155,10 @@ def distinct(index: Array, sizes: Array) -> Array:
     code = np.zeros(len(index), np.int64)
     for column, size in zip(index.T, sizes, strict=True):
         code = code * size + column
-    return np.asarray(index[np.unique(code, return_index=True)[1]])
+    order = np.argsort(code, kind="stable")
+    code = code[order]
+    first = np.append(True, code[1:] != code[:-1])
+    return np.asarray(index[order[first]])
 
 
 def cross(

@@ -87,15 +87,17 @@ def add_train(train: Any, x: Array, moved: bool, scale: Array, out: Array) -> No
     """
     centre, inverse, low, step, sizes, periods, ranks, offsets, flat, mean, whitening, tail = train
     n, count, tails = low.size, x.shape[1], tail[0] < math.inf
-    width, cells = 0, 0
+    width, cells, most = 1, 0, max(1, min(POINTS, count))
     for k in range(n):
         width, cells = max(width, ranks[k + 1]), max(cells, sizes[k] + 2 * PAD)
-    y, s, square, inside = np.empty((n, POINTS)), np.empty((n, POINTS)), np.empty(POINTS), np.empty(POINTS, np.bool_)
-    w, c, after = np.empty(6), np.empty(TOGETHER * 6 * width), np.empty(TOGETHER * width)
-    v, alive, cell = np.empty((POINTS, width)), np.empty(POINTS, np.int64), np.empty(POINTS, np.int64)
-    starts, order = np.empty(cells + 1, np.int64), np.empty(POINTS, np.int64)
-    for first in range(0, count, POINTS):
-        size, used = min(POINTS, count - first), 0
+    y, s, square, inside = np.empty((n, most)), np.empty((n, most)), np.empty(most), np.empty(most, np.bool_)
+    # Row row_of[p] of `v` belongs to point p of the block; `after` are the rows after an axis, in the order of its cells.
+    v, after, row_of = np.empty(most * width), np.empty(most * width), np.empty(most, np.int64)
+    w, c = np.empty(6), np.empty(TOGETHER * 6 * width)
+    alive, cell, order = np.empty(most, np.int64), np.empty(most, np.int64), np.empty(most, np.int64)
+    starts = np.empty(cells + 1, np.int64)
+    for first in range(0, count, most):
+        size, used = min(most, count - first), 0
         for d in range(n):
             for p in range(size):
                 y[d, p] = x[d, first + p] - centre[d]
@@ -120,43 +122,44 @@ def add_train(train: Any, x: Array, moved: bool, scale: Array, out: Array) -> No
                         white += whitening[k, d] * (y[d, p] - mean[d])
                     square[p] += white * white
         for p in range(size):
-            v[p, 0] = 1.0 if inside[p] else 0.0
             if inside[p]:
-                alive[used] = p
+                alive[used], row_of[p], v[used] = p, used, 1.0
                 used += 1
         for k in range(n):
             a, b = ranks[k], ranks[k + 1]
             starts[: sizes[k] + 2 * PAD + 1] = 0
             for i in range(used):
-                cell[alive[i]] = int(math.floor(s[k, alive[i]])) - 2 + PAD
-                starts[cell[alive[i]] + 1] += 1
+                cell[i] = int(math.floor(s[k, alive[i]])) - 2 + PAD
+                starts[cell[i] + 1] += 1
             for j in range(sizes[k] + 2 * PAD):
                 starts[j + 1] += starts[j]
             for i in range(used):
-                p = alive[i]
-                order[starts[cell[p]]] = p
-                starts[cell[p]] += 1
-            begin = 0
+                order[starts[cell[i]]] = alive[i]
+                starts[cell[i]] += 1  # now the end of the cell
+            begin, j = 0, 0
             while begin < used:
-                j, end = cell[order[begin]], begin
-                while end < used and end < begin + TOGETHER and cell[order[end]] == j:
-                    p, row = order[end], c[(end - begin) * 6 * a : (end - begin + 1) * 6 * a]
+                while starts[j] <= begin:
+                    j += 1
+                end = min(starts[j], begin + TOGETHER)
+                for i in range(begin, end):
+                    p = order[i]
+                    one, row = v[row_of[p] * a : (row_of[p] + 1) * a], c[(i - begin) * 6 * a : (i - begin + 1) * 6 * a]
                     taps(s[k, p] - math.floor(s[k, p]), w)
                     for d in range(6):
+                        factor = w[d]
                         for q in range(a):
-                            row[d * a + q] = w[d] * v[p, q]
-                    end += 1
-                base, group = offsets[k] + j * a * b, end - begin
+                            row[d * a + q] = factor * one[q]
+                group, base = end - begin, offsets[k] + j * a * b
                 matrix = flat[base : base + 6 * a * b].reshape(6 * a, b)
-                np.dot(c[: group * 6 * a].reshape(group, 6 * a), matrix, after[: group * b].reshape(group, b))
-                for i in range(group):
-                    for q in range(b):
-                        v[order[begin + i], q] = after[i * b + q]
+                np.dot(c[: group * 6 * a].reshape(group, 6 * a), matrix, after[begin * b : end * b].reshape(group, b))
                 begin = end
+            for i in range(used):
+                row_of[order[i]] = i
+            v, after = after, v
         for p in range(size):
             far = square[p] > tail[0]
             if inside[p] or far:
-                value = v[p, 0]
+                value = v[row_of[p]] if inside[p] else 0.0
                 if far:  # the train from twice the value at the radius, the Gaussian below it, smoothly in between
                     share = min(max(value / tail[2] - 1.0, 0.0), 1.0)
                     share *= share * (3.0 - 2.0 * share)
@@ -242,11 +245,12 @@ def skeleton(A: Array, tolerance: float, scaling: Any, most: int, rows: Array, c
     _to_factors(of_row, scaling[0], scaling[1])
     _to_factors(of_column, scaling[0], scaling[1])
     for q in range(b):
-        norms[q] = 0.0
+        column, size = rest[q], 0.0
         for p in range(m):
-            rest[q, p] = A[p, q] * of_row[p] * of_column[q]
-            norms[q] += rest[q, p] * rest[q, p]
-        total += norms[q]
+            column[p] = A[p, q] * of_row[p] * of_column[q]
+            size += column[p] * column[p]
+        norms[q] = size
+        total += size
     r = 0
     while r < most:
         left, best = 0.0, 0
@@ -337,24 +341,29 @@ def draw(packed: Any, right: Array, share: Array, flat: bool, out: Array) -> Non
     width, longest = 1, 1
     for k in range(n):
         width, longest = max(width, ranks[k + 1]), max(longest, sizes[k])
-    v, next_v, w, root = np.empty(width), np.empty(width), np.empty(longest), np.empty(longest)
+    v, next_v, sums = np.empty(width), np.empty(width), np.empty((n, 2))
+    laws, roots = np.empty((n, longest)), np.empty((n, longest))
     for p in range(count):
         v[0] = 1.0
         likely, drawn, at_right = 1.0, 1.0, 0
         for k in range(n):
             a, b, N = ranks[k], ranks[k + 1], sizes[k]
-            total, root_total = 0.0, 0.0
-            w[:N] = 0.0
-            for q in range(a):
-                factor, row = v[q], right[at_right + q * N : at_right + (q + 1) * N]
+            w, root = laws[k], roots[k]
+            if p == 0 or k > 0:  # the law on the first axis is that of all draws
+                total, root_total = 0.0, 0.0
+                w[:N] = 0.0
+                for q in range(a):
+                    factor, row = v[q], right[at_right + q * N : at_right + (q + 1) * N]
+                    for i in range(N):
+                        w[i] += factor * row[i]
                 for i in range(N):
-                    w[i] += factor * row[i]
-            for i in range(N):
-                w[i] = max(w[i], 0.0)
-                root[i] = math.sqrt(w[i])
-            for i in range(N):
-                total += w[i]
-                root_total += root[i]
+                    w[i] = max(w[i], 0.0)
+                    root[i] = math.sqrt(w[i])
+                for i in range(N):
+                    total += w[i]
+                    root_total += root[i]
+                sums[k, 0], sums[k, 1] = total, root_total
+            total, root_total = sums[k]
             at_right += N * a
             chosen, chosen_total = (root, root_total) if flat else (w, total)
             u, j, before = share[k, p] * chosen_total, 0, 0.0
@@ -367,8 +376,9 @@ def draw(packed: Any, right: Array, share: Array, flat: bool, out: Array) -> Non
             next_v[:b] = 0.0
             for s in range(a):
                 base, factor = offsets[k] + (j * a + s) * b, v[s]
+                row = cores[base : base + b]
                 for q in range(b):
-                    next_v[q] += factor * cores[base + q]
+                    next_v[q] += factor * row[q]
             top = 0.0
             for q in range(b):
                 top = max(top, abs(next_v[q]))
@@ -394,8 +404,9 @@ def values_on_grid(packed: Any, index: Array, out: Array) -> None:
             base = offsets[k] + index[p, k] * a * b
             next_v[:b] = 0.0
             for s in range(a):
+                factor, row = v[s], cores[base + s * b : base + (s + 1) * b]
                 for q in range(b):
-                    next_v[q] += v[s] * cores[base + s * b + q]
+                    next_v[q] += factor * row[q]
             for q in range(b):
                 v[q] = next_v[q]
         out[p] = v[0]

@@ -111,7 +111,7 @@ class Train:
             right.append(one @ right[-1])
         return left, right[::-1], total
 
-    @property
+    @cached_property
     def mass(self) -> float:
         """The integral over x."""
         return float(self._sums[0][-1][0, 0]) * self.grid.volume
