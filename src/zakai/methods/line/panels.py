@@ -42,7 +42,7 @@ MOST_PANELS = 500  # beyond which none is bisected
 EDGE = 1e-9  # density at the ends of panels, relative to the maximum, beyond which they are too few
 MUCH = 1e-3  # probability of an outermost panel beyond which the panels are too few before they are too long
 FASTEST = 100.0  # largest rate at which the drift contracts, times the length of the interval and the tolerance
-RATIO, FINER = 4.0, 1.2  # of the lengths of steps in time
+RATIO = 4.0  # of the lengths of steps in time, at first
 FIRST = 0.1  # of the time in which the drift would cross the range of the density, and of the interval: the first step
 REACH = 7.0  # standard deviations of the noise beyond the density before, between which the first panels lie
 DIFFUSED = 0.5  # of the time in which noise would double the variance: the first step
@@ -340,7 +340,7 @@ def settled(problem: Problem, allowed: float) -> Solution | None:
     ends = tuple(np.linspace(problem.low, problem.high, FIRST_PANELS + 1).tolist())
     element, best = _around(problem, np.full(2, problem.reach), ends), None
     for steps in (Steps(), Steps(RATIO))[problem.prepared.system.varying :]:
-        limit, before, in_time = TAIL * allowed, np.inf, False
+        limit, before, in_time, turned = TAIL * allowed, np.inf, steps.ratio > 0.0, False
         if problem.backward:
             forward = _ended(problem._replace(message=None), element, steps, limit)
             if forward is None:
@@ -361,13 +361,10 @@ def settled(problem: Problem, allowed: float) -> Solution | None:
                 best = second._replace(error=error)
             if error < allowed:
                 return best
-            if steps.ratio == RATIO:
-                steps = Steps(FINER)
-                continue
             if error > 0.3 * before:  # what was made finer did not matter
-                if in_time:
+                if turned:
                     break
-                in_time = True
+                in_time, turned = not in_time, True
             before = error
             if in_time:
                 steps = steps.finer(float(np.clip((allowed / error) ** 0.2, 0.15, 0.5)))  # the error is of fifth order
