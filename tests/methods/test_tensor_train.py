@@ -352,6 +352,23 @@ def test_the_estimate_holds_for_an_observation_in_the_tails_of_a_density_with_no
     assert errors_over_estimates(model, record) < 1
 
 
+def test_the_number_of_substeps_does_not_go_by_what_chance_hides():
+    model = zakai.Model(
+        state=["x", "y"], drift=["-0.585*x - 0.001*sin(1.541*y)", "-0.977*y - 1.503*cos(1.849*x)"],
+        diffusion=[[0.455, 0], [0, 0.411]], observation=["x - x**3/5"], observation_kind="samples",
+        observation_noise=[[167 / 12500]],
+        prior={"kind": "gaussian", "mean": [0.2426953563570059, -0.32235340677387603],
+               "cov": [[0.29127967294895996, -0.12747521964048827], [-0.12747521964048827, 0.13528115707306668]]},
+    )  # fmt: skip
+    times = np.array([0.050815536098659235, 0.5533350649459299, 0.5902885477666938, 2.908739555660891])
+    values = np.array([np.nan, 0.43044998905169696, 0.6357091065751453, 0.23096143915269426])
+    record = zakai.Record(times, values[:, None], "samples")
+    mean, variance = -1.0829013553475946, 0.15056380602964387  # sinc collocation on two grids, which differ by 1e-6
+    result = zakai.filter(model, record, "tensor-train")
+    assert not result.warnings
+    assert abs(result.mean[-1, 1] - mean) < 2e-3 * np.sqrt(variance)
+
+
 @pytest.mark.parametrize("seed", [1, 2])
 def test_errors_of_substeps_that_add_up_are_below_three_tolerances(seed):
     model = zakai.Model(

@@ -9,6 +9,9 @@ No build is needed: points take the filter's own substeps.  With another lineari
 step, their error was a third of that of the filter, or four times as large, after long gaps.  Each point moves with four noises,
 of both signs and with both halves of each substep in both orders: what is odd, or says nothing about the time step, cancels in
 their sum.
+
+What chance leaves is part of the error: of several numbers of substeps that are tried the smallest one would be taken whose error
+chance hides.  Where noise drives a state through cos(2 x), eleven substeps were measured at a ninth of their error.
 """
 
 from __future__ import annotations
@@ -30,7 +33,6 @@ from zakai.numerics.trains.train import Train
 POINTS, FEWER_POINTS, SMALL = 512, 128, 1e-2
 FEW = 100.0  # effective points that a likelihood must leave, or a power of it is taken
 FLOW = 0.1  # error of a flow in tolerances of a build, as in `Chain`
-LEAST = 0.25  # share of the square of an error that is left when that of the points is subtracted
 
 
 class TimeError(NamedTuple):
@@ -66,12 +68,13 @@ def measured(chain: Chain, u: Train, count: int, likelihood: Likelihood) -> Time
     each = one.weights * (moved - average) - other.weights * (terms - average)
     parts = 4.0 / 3.0 * each.reshape(len(each), 4, number).sum(axis=1)
     change, random = parts.sum(axis=1), (parts**2).sum(axis=1)
-    square = np.maximum(change**2 - random + change**2 / number, LEAST * change**2)
+    square = change**2 + random
     square[n:] *= 0.5
     if not np.isfinite(square).all():
         return None
     largest = float(square[: monomials(n).low].max())
-    return TimeError(count, math.sqrt(largest), Error.between(change, random, n))
+    error = Error.between(change, random, n)._replace(spread=parts[:n] @ parts[:n].T)
+    return TimeError(count, math.sqrt(largest), error)
 
 
 @dataclass(frozen=True)
