@@ -16,6 +16,7 @@ printed last: POINT, PARTICLE and MARGIN are to be multiplied by those of `expec
 from __future__ import annotations
 
 import argparse
+import hashlib
 import os
 import re
 import resource
@@ -54,7 +55,8 @@ def rms(values: np.ndarray) -> float:
 
 def judged(name: str, model: zakai.Model, record: zakai.Record, particles: int) -> dict[str, Any]:
     """Return means, deviations and the log-likelihood by many particles, kept in a file."""
-    path = Path(os.environ.get("TMPDIR", "/tmp")) / f"choices-{name}-{particles}.npz"
+    key = hashlib.sha256(record.values.tobytes()).hexdigest()[:8]
+    path = Path(os.environ.get("TMPDIR", "/tmp")) / f"choices-{name}-{particles}-{key}.npz"
     if not path.exists():
         one, two = (
             zakai.filter(model, record, "guided-particles", particles=particles, seed=1000 + i, keep="moments") for i in (0, 1)

@@ -9,6 +9,7 @@ coordinates.  The bootstrap filter moves particles by half a Runge-Kutta step, n
 from __future__ import annotations
 
 import argparse
+import hashlib
 import math
 import os
 import time
@@ -131,7 +132,8 @@ def bootstrap(model, record, count, seed, longest=0.05):
 
 def reference(name, model, record, count):
     """Return the mean of two runs with many particles, and half of their difference, kept in a file."""
-    path = Path(os.environ.get("TMPDIR", "/tmp")) / f"several-{name}-{count}.npz"
+    key = hashlib.sha256(record.values.tobytes()).hexdigest()[:8]
+    path = Path(os.environ.get("TMPDIR", "/tmp")) / f"several-{name}-{count}-{key}.npz"
     if not path.exists():
         one, two = (bootstrap(model, record, count, seed) for seed in (101, 102))
         np.savez(path, mean=(one[0] + two[0]) / 2, cov=(one[1] + two[1]) / 2, log=(one[2] + two[2]) / 2,
