@@ -142,3 +142,54 @@ def test_a_stiff_state_that_particles_carry_as_a_gaussian_is_judged_by_its_devia
     assert result.health["linear_states"][1] == 1
     assert (np.abs(result.mean - exact.mean)[1:] / np.sqrt(exact.variance[1:])).max() < 0.05
     assert np.nanmax(result.health["time_error"]) < 0.05
+
+
+STIFF = {
+    "state": ["s", "v"], "diffusion": [["0.1", "0"], ["0", "0.02"]], "inputs": ["I"], "observation": ["s - v"],
+    "observation_kind": "samples", "observation_noise": [["0.001"]],
+    "prior": {"kind": "gaussian", "mean": [0.0, 0.0], "cov": [0.01, 0.01]},
+}  # fmt: skip
+INPUT_TIMES = [0.0, 0.2, 0.25, 0.75, 1.25, 1.3, 1.5, 2.0]
+CURRENT = [0.0, 0.1, 0.0, 0.06, 0.12, 0.02, 0.1, 0.0]
+
+
+def _stiff_record() -> zakai.Record:
+    """Return samples before and after jumps of an input, 3 to 33 time constants apart."""
+    values = [0.02, -0.05, np.nan, 0.03, np.nan, np.nan, 0.1, -0.1]
+    return zakai.Record([*INPUT_TIMES[1:], 2.2], values, "samples", inputs=zakai.Inputs(INPUT_TIMES, CURRENT))
+
+
+@pytest.mark.parametrize("drift", [["-0.3*s", "60*I - 66*v"], ["-0.3*s + 20*v", "60*I - 66*v - 10*s"]])
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_stiff_affine_drift_is_integrated_exactly_between_the_times_of_inputs(drift, seed):
+    model, record = zakai.Model(drift=drift, **STIFF), _stiff_record()
+    result, exact = zakai.filter(model, record, PARTICLES, seed=seed, split=False), zakai.filter(model, record, "kalman-bucy")
+    assert (np.abs(result.mean - exact.mean)[1:] / np.sqrt(exact.variance[1:])).max() < 0.06
+    assert np.abs(np.sqrt(result.variance / exact.variance)[1:] - 1.0).max() < 0.03
+    assert np.nanmax(result.health["time_error"]) == 0.0
+    assert np.nanmax(result.health["substeps"]) < 12
+
+
+@pytest.mark.parametrize("split", [True, False])
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_stiff_linear_state_beside_another_one_follows_its_input(split, seed):
+    # The second state does not depend on the first: between samples it is that of an Ornstein-Uhlenbeck process.
+    model, record = zakai.Model(drift=["-0.3*s - s**3", "60*I - 66*v"], **STIFF), _stiff_record()
+    result = zakai.filter(model, record, PARTICLES, seed=seed, split=split)
+    for k, length in ((3, 0.5), (5, 0.05), (6, 0.2)):  # rows without a sample
+        decayed = np.exp(-66 * length)
+        mean = result.mean[k - 1, 1] * decayed + 60 / 66 * CURRENT[k - 1] * (1 - decayed)
+        variance = result.variance[k - 1, 1] * decayed**2 + 0.02**2 / 132 * (1 - decayed**2)
+        assert result.mean[k, 1] == pytest.approx(mean, abs=(0.002 if split else 0.06) * np.sqrt(variance))
+        assert result.variance[k, 1] == pytest.approx(variance, rel=0.002 if split else 0.08)
+
+
+def test_a_stiff_state_that_follows_another_one_keeps_its_correlation_with_it():
+    # At rates of 66 v is that of 30 sin(s) within a sixtieth of a unit of time: of the variance given s little is left.
+    model = zakai.Model(drift=["-0.3*s", "60*I - 66*v + 30*sin(s)"], **STIFF)
+    record = zakai.Record(INPUT_TIMES[1:], np.full(7, np.nan), "samples", inputs=_stiff_record().inputs)
+    result = zakai.filter(model, record, PARTICLES, particles=20000, split=False)
+    exact = zakai.filter(model, record, "tensor-train")
+    direction = np.array([30 / 66, -1.0])
+    own, known = (np.einsum("i,kij,j->k", direction, one.cov, direction)[1:] for one in (result, exact))
+    assert own == pytest.approx(known, rel=0.1)

@@ -10,7 +10,7 @@ from scipy.stats import qmc
 
 from zakai.numerics.particles.even import Even, curve_places, directions, even_normals
 from zakai.numerics.particles.noise import noise_about_middle, write_roots
-from zakai.numerics.particles.population import carry, mean_directions, moments, sums_of_islands
+from zakai.numerics.particles.population import Sums, carry, mean_directions, moments, sums_of_islands
 from zakai.numerics.particles.random import key_of
 
 RNG = np.random.default_rng(0)
@@ -53,10 +53,11 @@ def test_mean_directions_are_those_of_weighted_angles():
 
 def test_sums_of_islands():
     bounds, weights, apart = np.array([0, 30, 30, 75, 90]), RNG.random(90), RNG.normal(size=(2, 90))
-    sums, masses, independent = np.empty((4, 2)), np.empty(4), np.empty(2)
-    sums_of_islands(bounds, weights, apart, sums, masses, independent)
+    masses, sums, squares, independent = out = Sums(np.empty(4), np.empty((4, 2)), np.empty((4, 2)), np.empty(2))
+    sums_of_islands(bounds, weights, apart, out)
     parts = [slice(*pair) for pair in zip(bounds[:-1], bounds[1:])]
     assert np.allclose(sums, [apart[:, part] @ weights[part] for part in parts])
+    assert np.allclose(squares, [apart[:, part] ** 2 @ weights[part] for part in parts])
     assert np.allclose(masses, [weights[part].sum() for part in parts])
     assert np.allclose(independent, 90 / 89 * (weights * apart) ** 2 @ np.ones(90))
 

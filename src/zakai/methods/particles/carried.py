@@ -25,12 +25,12 @@ from zakai.methods._protocol import Backward, Info
 from zakai.methods.particles import filter as particle_filter
 from zakai.methods.particles.backward import BACKWARD as PLAIN_BACKWARD
 from zakai.methods.particles.conditional import ConditionalSystem, covariances
-from zakai.methods.particles.interval import TIME_ERROR
 from zakai.methods.particles.moments import moments_of
 from zakai.methods.particles.programs import Array
 from zakai.methods.particles.state import Cloud, Prepared, Rule, State
 from zakai.methods.particles.substeps import substeps
 from zakai.methods.particles.system import root
+from zakai.methods.particles.time_step import TIME_ERROR
 from zakai.methods.particles.validity import valid as valid_state
 from zakai.numerics.particles.random import normals
 

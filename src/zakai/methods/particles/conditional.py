@@ -159,7 +159,6 @@ class ConditionalSystem(System):
                 self.owners[linear[i], 2] = model.n + k
         others = [(linear[i], linear[j], -1) for i, j in self.block.pairs]
         self.owners = np.append(self.owners, np.array(others).reshape(-1, 3), axis=0)
-        self.affine = False
 
     def _set_formulas(self) -> None:
         model, block = self.model, self.block

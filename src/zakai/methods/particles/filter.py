@@ -11,6 +11,7 @@ References:
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -20,7 +21,7 @@ import numpy as np
 from zakai.methods._protocol import Info
 from zakai.methods.particles.block import FEW, TRIED
 from zakai.methods.particles.events import Interval, Observed, with_update
-from zakai.methods.particles.islands import CAUTION, FEW_ISLANDS, Islands, regression
+from zakai.methods.particles.islands import CAUTION, FEW_FAR, FEW_ISLANDS, Islands, regression
 from zakai.methods.particles.moments import moments_of
 from zakai.methods.particles.programs import Array
 from zakai.methods.particles.proposals import HOPELESS, MOST_RESTS, TEMPER_BELOW, advanced
@@ -101,7 +102,8 @@ def step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[State
 
 FIGURES = (
     "effective_sample_size", "particles", "founders", "largest_weight", "tempering_levels", "acceptance", "time_error",
-    "monte_carlo_error", "log_likelihood_error", "lower_bound", "uncertain_error", "guided", "moved", "linear_states", "substeps",
+    "monte_carlo_error", "deviation_error", "log_likelihood_error", "lower_bound", "uncertain_error", "guided", "moved",
+    "linear_states", "substeps",
 )  # fmt: skip
 
 
@@ -145,7 +147,7 @@ def _step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[Stat
     weights, cov = done.weights, after.cov
     size, largest = effective(weights), float(weights.max())
     T, end = regression(before.particles, after.particles, cloud.parents), after
-    cloud = cloud._replace(islands=cloud.islands.carried(T), parents=None)
+    cloud = cloud._replace(islands=cloud.islands.carried(T, before.particles, after.particles), parents=None)
     found = cloud.islands.spread(after.particles)
     doubtful = size < TEMPER_BELOW * len(weights) or done.levels > 3
     acceptance, moved = done.acceptance, 0.0
@@ -170,7 +172,8 @@ def _step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[Stat
         if change is not None:
             weights = np.exp(cloud.logs)
             end = moments_of(system, cloud.particles, weights)
-            islands, cov = cloud.islands.carried(regression(after.particles, end.particles, cloud.parents)), end.cov
+            T_moved = regression(after.particles, end.particles, cloud.parents)
+            islands, cov = cloud.islands.carried(T_moved, after.particles, end.particles), end.cov
             acceptance, doubtful_move = accepted, accepted < 0.1 or change < 0.5
             if len(cloud.window.first) and not doubtful_move:
                 islands = islands.renewed()
@@ -192,8 +195,8 @@ def _step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[Stat
     spread = end.deviations
     positive = np.where(spread > 0, spread, np.inf)
     share = variance / positive**2
-    random_error = float(np.sqrt(share.max()))
-    doubtful = doubtful or found.effective < FEW_ISLANDS
+    random_error, deviation_error = float(np.sqrt(share.max())), 0.5 * math.sqrt(found.wide)
+    doubtful = doubtful or found.effective < FEW_ISLANDS or deviation_error > FEW_FAR
     until = islands.age + DOUBTFUL if doubtful else control.doubtful_until
     marked = islands.age < until or not families.forgotten
     health = {
@@ -205,6 +208,7 @@ def _step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[Stat
         "acceptance": acceptance,
         "time_error": float((np.abs(shift) / positive).max()),
         "monte_carlo_error": random_error,
+        "deviation_error": deviation_error,
         "log_likelihood_error": float(np.sqrt(evidence)),
         "lower_bound": float(marked),
         "uncertain_error": CAUTION * random_error if marked else 0.0,

@@ -15,6 +15,7 @@ from zakai.methods._protocol import Method
 from zakai.methods.particles.carried import BACKWARD, density, step, valid
 from zakai.methods.particles.conditional import conditional_system
 from zakai.methods.particles.filter import MOST_GROWTH, VARIANCE, init, reduced
+from zakai.methods.particles.islands import FEW_FAR
 from zakai.methods.particles.split import split_of
 from zakai.methods.particles.state import Prepared, Rule, State
 from zakai.methods.particles.system import System, system_of
@@ -105,6 +106,10 @@ def _system(model: Model, split: object) -> System:
 
 BOUNDS = {
     "monte_carlo_error": (0.1, "standard error of a mean, in standard deviations; lower the tolerance or name more particles"),
+    "deviation_error": (
+        FEW_FAR, "relative standard error of a standard deviation: few particles hold a part of the density that is far from the "
+        "rest, as a second mode, and other seeds may not have it; name more particles",
+    ),
     "uncertain_error": (
         0.2, "error of a mean, in standard deviations, that is possible where the standard errors are lower bounds, because an "
         "observation left few particles or few ancestors; run another seed and compare, or name more particles",

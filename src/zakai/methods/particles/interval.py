@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.linalg import expm
 
 from zakai.methods.particles.events import Events, Flows, Interval
 from zakai.methods.particles.programs import Array, Expressions
@@ -18,20 +16,10 @@ from zakai.numerics.particles import noise as noise_kernels
 from zakai.numerics.particles.chunks import over_chunks
 from zakai.numerics.particles.formulas import evaluate
 from zakai.numerics.particles.motion import ADDITIVE, ORDERED, Arrival, advance
-from zakai.numerics.particles.random import key_of, normals
-from zakai.numerics.particles.step_errors import StepErrors, step_errors
 
-PILOTS = 128  # particles by which the time step is measured
-# Of a mean or a standard deviation by one interval, in standard deviations, that a step is chosen for, or this share of the
-# standard error of a mean where that is more, up to a largest one.
-TIME_ERROR, OF_RANDOM_ERROR, MOST_TIME_ERROR = 0.005, 0.1, 0.1
-MOST_SUBSTEPS = 64
-DECAYED = 4.0  # times e that a deviation may shrink within one of the substeps that are tried first
-LEAST_CONTRACTION = 0.02  # ratio of deviations at the end and the start of an interval, below which errors are not judged by it
 # Measured: a line of a formula, and a coordinate in an evaluation of a flow, take 0.6 ns, a normal number 4 ns, and all that is
 # done with a particle after an interval 60 ns.
 NORMAL, EVERY = 7, 100
-EXACT = 1e-3  # relative error of the flow of an affine system without time that is not measured
 
 
 class Scheme(NamedTuple):
@@ -55,11 +43,21 @@ class Motion:
 
     @cached_property
     def arrays(self) -> tuple[Any, ...]:
-        """The drift, the fields of the noise, the ends of the domain, the kind of the noise, and the update of the state."""
+        """The drift, the noise's fields, the ends of the domain, the kind of the noise, the update of the state, and L."""
         system = self.system
         update = Expressions([], system.model) if system.update is None else system.update
         drift, fields, update_ = (tuple(part.at(self.theta)) for part in (system.drift, system.fields, update))
-        return drift, fields, system.box, system.kind, update_
+        return drift, fields, system.box, system.kind, update_, self.linear_part
+
+    @cached_property
+    def linear_part(self) -> Array:
+        """L (n, n): the matrix of an affine drift, else the constant rates of states that decay, or (0, 0) for none."""
+        system = self.system
+        if system.linear_part is None:
+            return np.zeros((0, 0))
+        model = system.model
+        L = np.asarray(system.linear_part(np.zeros(model.n), float(model.start), self.theta), float)
+        return np.ascontiguousarray(L if system.affine else np.minimum(L, 0.0))
 
     @cached_property
     def law(self) -> tuple[Any, ...]:
@@ -123,8 +121,7 @@ class Motion:
     @cached_property
     def constant_matrix(self) -> Array:
         """The matrix of an affine drift."""
-        n = self.system.model.n
-        return self.matrix(np.zeros(n), np.ones(n), float(self.system.model.start), np.zeros(self.system.drift.width))
+        return self.linear_part if self.linear_part.size else np.zeros((self.system.n, self.system.n))
 
     def matrix(self, x: Array, scale: Array, t: float, given: Array) -> Array:
         """Return df/dx (n, n) at a point (n,), by forward differences."""
@@ -145,11 +142,19 @@ class Motion:
         A = self.matrix(mean, scale, interval.start, given[0, 0])
         return float(np.linalg.norm(A * scale / scale[:, None]))
 
-    def decay(self, interval: Interval, values: Array, mean: Array, scale: Array) -> float:
-        """Return the rate at which a direction decays fastest at a mean (n,) at the start of an interval, or zero."""
+    def decay(self, interval: Interval, values: Array, mean: Array, scale: Array) -> tuple[float, float]:
+        """Return the rates at which a direction decays fastest at a mean (n,) at the start of an interval, or zero.
+
+        The first one is that of directions that the noise reaches, the second one that of all without the linear part.
+        """
         given = self.given_numbers(interval, np.array([[interval.start, interval.stop]]), values)
-        A = self.matrix(mean, scale, interval.start, given[0, 0])
-        return max(0.0, -float(np.linalg.eigvals(A).real.min())) if np.isfinite(A).all() else 0.0
+        A = self.linear_part
+        if not self.system.affine:
+            A = self.matrix(mean, scale, interval.start, given[0, 0])
+        elif not A.size:
+            return 0.0, 0.0
+        noisy, rest = self.system.noisy, A - self.linear_part if self.linear_part.size else A
+        return _decay(A[np.ix_(noisy, noisy)]), _decay(rest)
 
     def events(self, interval: Interval, scheme: Scheme, values: Array, mean: Array, scale: Array) -> Events:
         """Return the events of an interval in equal substeps.
@@ -287,194 +292,13 @@ class Motion:
         return self.system.own_noise(t, P, self.theta, u)
 
 
+def _decay(A: Array) -> float:
+    """Return the rate at which a direction decays fastest, or zero."""
+    return max(0.0, -float(np.linalg.eigvals(A).real.min())) if A.size and np.isfinite(A).all() else 0.0
+
+
 def noise_about_middle(A: Array, G: Array, length: float) -> Array:
     """Return int exp(-s A) G exp(-s A') ds (n, n) over (-length/2, length/2): the noise of a substep, carried to its middle."""
     found = np.empty_like(G)
     noise_kernels.noise_about_middle(A, np.ascontiguousarray(G), length, found)
     return found
-
-
-class Steps(NamedTuple):
-    """The scheme of an interval, the shift (n,) of the mean that it leaves, and its error in standard deviations.
-
-    `surely` is the error with what a finite number of pilots leaves open; not `measured` are those that follow from the last one.
-    """
-
-    scheme: Scheme
-    shift: Array
-    error: float
-    surely: float
-    measured: bool = True
-
-
-class Pilots(NamedTuple):
-    """What measures the time step.
-
-    States (n, PILOTS), their mean (n,), deviations (n,), a whole number for the noise, and the error that is allowed.
-    """
-
-    states: Array
-    mean: Array
-    scale: Array
-    key: int
-    allowed: float
-
-
-def steps_of(motion: Motion, interval: Interval, values: Array, pilots: Pilots, guess: int) -> Steps:
-    """Return the cheapest scheme whose error in the mean and the spread, in standard deviations, is at most the allowed one.
-
-    Args:
-        motion: the formulas.
-        interval: the interval.
-        values: the increments (m,).
-        pilots: what it is measured with.
-        guess: the first number of substeps to try.
-    """
-    system = motion.system
-    if system.sampled and system.affine and not system.driven:
-        # One substep is exact but for the flow, whose error is bounded by that of the exponential series.
-        size = 0.5 * float(np.abs(motion.constant_matrix).sum(axis=1).max()) * (interval.stop - interval.start)
-        if size**5 / 60 <= EXACT:
-            return Steps(Scheme(1, 4), np.zeros(system.n), size**5 / 60, size**5 / 60)
-    # Where the noise of a whole substep decays, s and 2 s substeps agree that there is none.
-    decays = motion.decay(interval, values, pilots.mean, pilots.scale) * (interval.stop - interval.start)
-    count = max(1, guess, math.ceil(min(decays / DECAYED, MOST_SUBSTEPS)))
-    found = Steps(Scheme(count, 4), np.full(system.n, np.nan), np.inf, np.inf)
-    for turn in range(4):
-        errors = _time_errors(motion, interval, values, pilots._replace(key=pilots.key + turn), count)
-        # The flow is of a higher order than the noise: fewer substeps than half of what was measured may have any error.
-        least = -(-count // 2) if turn == 3 else 1
-        choices = [_needed(Scheme(count, stages), *one, pilots.allowed, least) for stages, one in errors.items()
-                   if np.isfinite(one[0])]  # fmt: skip
-        if not choices:
-            if count >= MOST_SUBSTEPS:
-                break
-            count = min(4 * count, MOST_SUBSTEPS)
-            continue
-        found = min(choices, key=lambda one: (max(one.error, 1.001 * pilots.allowed), one.scheme.work, one.scheme.substeps))
-        wanted = found.scheme.substeps
-        if count <= 2 * wanted <= 4 * count:
-            break
-        count = max(wanted, int(np.sqrt(count * wanted)))
-    return found
-
-
-def _needed(measured: Scheme, error: float, shift: Array, surely: float, allowed: float, least: int) -> Steps:
-    """Return the substeps that an error of second order in their length needs, at least so many."""
-    count = measured.substeps
-    wanted = int(np.clip(np.ceil(count * np.sqrt(error / allowed)), least, MOST_SUBSTEPS))
-    share = (count / wanted) ** 2
-    return Steps(Scheme(wanted, measured.stages), share * shift, share * error, share * surely)
-
-
-def _time_errors(
-    motion: Motion, interval: Interval, values: Array, pilots: Pilots, count: int
-) -> dict[int, tuple[float, Array, float]]:
-    """Return the errors of `count` substeps of 2 and of 4 stages, by the difference from twice as many, times 4/3.
-
-    By the number of stages: the largest error of a mean or a deviation, in standard deviations, the shift of the mean (n,),
-    and the error with that of the pilots.
-    """
-    system, found = motion.system, coupled(motion, interval, values, pilots, count)
-
-    def change(stages: int) -> tuple[float, Array, float]:
-        x, gained = found.by(motion, stages)
-        shift, largest = np.empty(system.n), np.empty(2)
-        errors = StepErrors(
-            found.start, x, gained, found.finer, found.finer_gained, system.angles, pilots.scale, found.variances,
-            system.owners,
-        )
-        step_errors(errors, LEAST_CONTRACTION, shift, largest)
-        return 4 / 3 * float(largest[0]), 4 / 3 * shift, 4 / 3 * float(largest[1])
-
-    return {2: change(2), 4: change(4)}
-
-
-class Coupled(NamedTuple):
-    """Pilots that twice as many substeps moved from `start` to `finer` (n, N), and the `coarse` events with the same `noise`.
-
-    `variances` (n,) are by how much the noise of the coarse events has more variance at the end.
-    """
-
-    start: Array
-    finer: Array
-    finer_gained: Array
-    coarse: Events
-    noise: Array
-    variances: Array
-
-    def by(self, motion: Motion, stages: int) -> tuple[Array, Array]:
-        """Return the ends (n, N) by the coarse events in so many stages, and the integrated log weights (N,)."""
-        places = self.coarse.places.copy()
-        places[:, 2] = stages
-        return motion.advanced(self.coarse._replace(places=places), self.start, self.noise)
-
-
-def coupled(motion: Motion, interval: Interval, values: Array, pilots: Pilots, count: int) -> Coupled:
-    """Return pilots after an interval by 2 `count` substeps, and what moves them by `count` with the same noise."""
-    system, mean, scale = motion.system, pilots.mean, pilots.scale
-    (coarse, slopes), (fine, _) = (motion.linearised(interval, Scheme(k, 4), values, mean, scale) for k in (count, 2 * count))
-    noise, start = np.empty((fine.width, pilots.states.shape[1])), pilots.states
-    normals(key_of(pilots.key), 0, noise.shape[1], noise)
-    if system.kind != ADDITIVE:
-        noise, start = _exchanged(fine, noise, start)
-    carried = 0.25 * (interval.stop - interval.start) / count * slopes
-    shared = _coarse_noise(motion, coarse, fine, noise, carried)
-    y, gained = motion.advanced(fine, start, noise)
-    variances = np.zeros(system.n)
-    if system.kind == ADDITIVE and not system.affine and fine.width and len(coarse.times) == count + 1:
-        variances = _more_variance(coarse.roots, fine.roots, carried)
-    return Coupled(start, y, gained, coarse, shared, variances)
-
-
-def _more_variance(coarse: Array, fine: Array, carried: Array) -> Array:
-    """Return by how much kicks of substeps (J, n, d) have more variance (n,) at the end than those of their halves (2 J, n, d).
-
-    `carried` (J, n, n) is df/dx times a quarter of a substep.  Pilots do not show it: the kicks of both are the same.
-    """
-    ahead, back = expm(carried), expm(-carried)
-    halves = ahead @ fine[::2], back @ fine[1::2]
-    apart = coarse @ coarse.transpose(0, 2, 1) - sum(half @ half.transpose(0, 2, 1) for half in halves)
-    total, half = np.zeros(apart.shape[1:]), ahead @ ahead
-    for own, flow in zip(apart, half, strict=True):
-        total = flow @ (flow @ total @ flow.T + own) @ flow.T
-    return total.diagonal().copy()
-
-
-def _exchanged(fine: Events, noise: Array, start: Array) -> tuple[Array, Array]:
-    """Return pairs of pilots with equal starts, where one has the noise of both halves of each substep in the other order.
-
-    Which half has which noise moves the end by a first-order difference that says nothing about the time step; in pairs it
-    cancels.
-    """
-    half, width, count = start.shape[1] // 2, int(fine.rows[0, 1]), len(fine.rows)
-    parts = noise.reshape(count, -1, noise.shape[1])[:, :, :half]
-    other = parts.copy()
-    other[0::2, :width], other[1::2, :width] = parts[1::2, :width], parts[0::2, :width]
-    both = np.concatenate([parts, other], axis=2).reshape(len(noise), -1)
-    return both, np.concatenate([start[:, :half], start[:, :half]], axis=1)
-
-
-def _coarse_noise(motion: Motion, coarse: Events, fine: Events, noise: Array, carried: Array) -> Array:
-    """Return the noise of the substeps that makes the same kicks as that of their halves, carried to the middle.
-
-    `carried` (J, n, n) is df/dx times a quarter of a substep.  What the linearised flow does to the kicks on their way says
-    nothing about the time step, and in the mean of few pilots would hide what does.
-    """
-    count, pilots = len(coarse.rows), noise.shape[1]
-    if motion.system.kind == ADDITIVE:
-        if not fine.width:
-            return np.zeros((0, pilots))
-        kicks = fine.roots @ noise.reshape(2 * count, -1, pilots)
-        both, apart = kicks[::2] + kicks[1::2], kicks[::2] - kicks[1::2]
-        both += carried @ (apart + 0.5 * carried @ both)
-        shared = np.linalg.pinv(coarse.roots, rcond=1e-6) @ both
-        return np.ascontiguousarray(shared.reshape(coarse.width, pilots))
-    shared = np.zeros((coarse.width, pilots))
-    for j in range(count):
-        first, width, coin = coarse.rows[j]
-        halves = [noise[begin : begin + own] for begin, own, _ in fine.rows[2 * j : 2 * j + 2]]
-        shared[first : first + width] = (halves[0] + halves[1]) / np.sqrt(2)
-        if coin:
-            shared[first + width] = noise[fine.rows[2 * j, 0] + fine.rows[2 * j, 1]]
-    return shared

@@ -3,6 +3,7 @@
 The offspring of a particle belong to its island, and the noise of islands is independent.  With the weights w of the particles
 
     variance of a mean       = R / (R - 1) sum over R islands of (sum w_i (x_i - mean))^2
+    variance of a variance V = R / (R - 1) sum over R islands of (sum w_i ((x_i - mean)^2 - V))^2
     variance of log evidence = R / (R - 1) sum over R islands of (sum w_i - 1 / R)^2
 
 whatever is done inside of an island: its noise may fill its space evenly, and its particles may descend from few.  An island
@@ -11,7 +12,9 @@ of equal sizes.  The error until then, a covariance X, is carried through every 
 
     X <- T X T',     T = cov(x after the observation, x before the interval) cov(x before)^-1
 
-and added: T is near 0 for a state that forgets, and near 1 for a constant of which the observations say little.
+and added: T is near 0 for a state that forgets, and near 1 for a constant of which the observations say little.  The error of a
+variance, relative to it, is large where few particles are far from the others.  That until then is carried by the largest share
+of a variance that is explained by the states before the interval.
 
 References:
     Lee and Whiteley 2018, Variance estimation in the particle filter (the same with the families of single particles).
@@ -27,11 +30,12 @@ import numpy as np
 from zakai.methods.particles.moments import Weighted
 from zakai.methods.particles.programs import Array
 from zakai.numerics.particles.even import Even, curve_places, directions
-from zakai.numerics.particles.population import carry, sums_of_islands
+from zakai.numerics.particles.population import Sums, carry, sums_of_islands
 
 ISLANDS, FEWEST = 16, 4  # islands, and particles of one at least
 # Effective shares of the islands: below the first one particles are dealt to new ones, below the second the spread is not known.
 UNEVEN, FEW_ISLANDS = 0.5, 0.25
+FEW_FAR = 0.2  # relative error of a standard deviation, above which few particles hold what is far from the others
 FEW_FOUNDERS = 20  # below which first ancestors are too few for a state that does not forget them
 # Few first ancestors matter to a state with this share of its variance between their families: of a constant all is, and of a
 # state that forgets it is their number over that of the particles.
@@ -43,7 +47,8 @@ class Islands(NamedTuple):
     """The particles of each island, from one of the `bounds` (R + 1,) to the next, and what they descend from.
 
     `founders` (N,) are the first ancestors, of `first` particles.  `age` counts resamplings, `epoch` the times at which islands
-    were made, and `settled` is the variance of the log-likelihood until then.  `excess` (n, n) is X.
+    were made, and `settled` is the variance of the log-likelihood until then.  `excess` (n, n) is X, and `wide` the relative
+    variance of a variance until then.
     """
 
     bounds: Array
@@ -53,11 +58,12 @@ class Islands(NamedTuple):
     epoch: int
     settled: float
     excess: Array
+    wide: float
 
     @classmethod
     def begin(cls, count: int, n: int) -> Islands:
         """Return independent particles of n states."""
-        return cls(_dealt(count), np.arange(count, dtype=np.int32), count, 0, 0, 0.0, np.zeros((n, n)))
+        return cls(_dealt(count), np.arange(count, dtype=np.int32), count, 0, 0, 0.0, np.zeros((n, n)), 0.0)
 
     @property
     def label(self) -> Array:
@@ -91,20 +97,31 @@ class Islands(NamedTuple):
         """Return new islands of so many particles, and which of them, in order along a curve, is each."""
         bounds = _dealt(count)
         deal = np.concatenate([np.arange(b, count, len(bounds) - 1) for b in range(len(bounds) - 1)])
-        return self._replace(bounds=bounds, epoch=self.epoch + 1, settled=self.settled + spread.evidence, excess=spread.cov), deal
+        settled = self.settled + spread.evidence
+        islands = self._replace(
+            bounds=bounds, epoch=self.epoch + 1, settled=settled, excess=spread.cov, wide=spread.wide
+        )
+        return islands, deal
 
     def spread(self, now: Weighted) -> Spread:
         """Return what the islands say of the errors of weighted particles."""
         n, R = len(now.cov), len(self.bounds) - 1
-        sums, masses, independent = np.empty((R, n)), np.empty(R), np.empty(n)
-        sums_of_islands(self.bounds, now.weights, now.deviations, sums, masses, independent)
-        factor = R / (R - 1)
+        out, factor = Sums(np.empty(R), np.empty((R, n)), np.empty((R, n)), np.empty(n)), R / (R - 1)
+        sums_of_islands(self.bounds, now.weights, now.deviations, out)
+        masses, sums, squares, independent = out
         cov = factor * (sums.T @ sums) + self.excess
-        return Spread(cov, factor * float(np.sum((masses - 1.0 / R) ** 2)), independent, 1.0 / (R * float(masses @ masses)))
+        total = squares.sum(axis=0)
+        apart = squares / np.where(total > 0, total, np.inf) - masses[:, None]
+        wide = factor * float(np.sum(np.where(total > 0, apart, 0.0) ** 2, axis=0).max()) + self.wide
+        evidence = factor * float(np.sum((masses - 1.0 / R) ** 2))
+        return Spread(cov, wide, evidence, independent, 1.0 / (R * float(masses @ masses)))
 
-    def carried(self, T: Array) -> Islands:
-        """Return the islands with X after an interval."""
-        return self._replace(excess=T @ self.excess @ T.T)
+    def carried(self, T: Array, before: Weighted, after: Weighted) -> Islands:
+        """Return the islands with what has been carried from before an interval to after it."""
+        positive = np.diag(after.cov) > 0
+        explained = np.diag(T @ before.cov @ T.T)[positive] / np.diag(after.cov)[positive]
+        share = min(float(explained.max(initial=0.0)), 1.0)
+        return self._replace(excess=T @ self.excess @ T.T, wide=share**2 * self.wide)
 
     def renewed(self) -> Islands:
         """Return the islands of particles whose first ancestors have been drawn again."""
@@ -126,13 +143,15 @@ class Islands(NamedTuple):
 
 
 class Spread(NamedTuple):
-    """The covariance (n, n) of the means and the variance of the log-likelihood since the islands were made.
+    """The covariance (n, n) of the means, and the variance of the log-likelihood since the islands were made.
 
+    `wide` is the largest variance of a variance, relative to its square.
     `independent` (n,) are the variances of the means of as many independent draws with these weights, `effective` the share of
     the islands that has the mass.
     """
 
     cov: Array
+    wide: float
     evidence: float
     independent: Array
     effective: float

@@ -7,19 +7,20 @@ import math
 import numpy as np
 
 from zakai.methods.particles.events import Interval
-from zakai.methods.particles.interval import (
+from zakai.methods.particles.interval import Scheme
+from zakai.methods.particles.programs import Array
+from zakai.methods.particles.state import PILOT, Control, Prepared, State
+from zakai.methods.particles.time_step import (
     MOST_SUBSTEPS,
     MOST_TIME_ERROR,
     OF_RANDOM_ERROR,
     PILOTS,
     TIME_ERROR,
     Pilots,
-    Scheme,
     Steps,
+    least_substeps,
     steps_of,
 )
-from zakai.methods.particles.programs import Array
-from zakai.methods.particles.state import PILOT, Control, Prepared, State
 from zakai.methods.particles.window import taken
 from zakai.numerics.particles.population import systematic
 from zakai.numerics.particles.random import uniform_number
@@ -45,6 +46,9 @@ def substeps(
     length = interval.stop - interval.start
     if length <= 0:
         return Steps(Scheme(1, 4), np.zeros(len(mean)), 0.0, 0.0), control
+    if prepared.system.exact:
+        count, _ = least_substeps(prepared.motion, interval, values, about)
+        return Steps(Scheme(count, 4), np.zeros(len(mean)), 0.0, 0.0), control
     # The error of an interval is of the third order of its length, and was measured in deviations of that time.
     jumps, pace = interval.inputs_change(hold), prepared.motion.pace(interval, values, mean, scale)
     ratio = (length / control.length) ** 3 if control.length and not jumps else np.inf
@@ -57,6 +61,8 @@ def substeps(
         steepness = prepared.motion.steepness(interval, values, mean, scale)
         alike = pace <= FASTER * control.pace and steepness <= STEEPER * control.steepness
     if control.trusted and alike and ratio <= LONGER and guess <= MOST_SUBSTEPS:
+        if control.substeps > 1:
+            guess = max(guess, least_substeps(prepared.motion, interval, values, about)[0])
         ratio *= (control.substeps / guess) ** 2
         error = control.error * ratio
         known = Steps(Scheme(guess, control.stages), state.last_shift * ratio, error, error, False)

@@ -67,11 +67,15 @@ class System:
         self.angles = np.array([name in model.periodic for name in model.state])
         # The coordinates by which each one contracts, and the row of the variance that particles carry: see `StepErrors`.
         self.owners = np.column_stack([np.arange(n), np.full((n, 2), -1)])
-        self.affine = self.kind == ADDITIVE and _is_affine(model)
-        self.driven = bool(model.drift.free_symbols & {model.t, *model.u})  # whether f depends on time
         self.timed = bool(model.inputs) or any(
             part.has(model.t) for part in (model.diffusion, model.process_noise, model.observation_noise, model.cross_noise)
         )
+        self.driven = bool(model.drift.free_symbols & {model.t, *model.u})  # whether f depends on time
+        # Whether kicks between exact flows are exact: the drift is constant between the times of inputs, and so is the noise.
+        drift = set[sp.Symbol]().union(*(f.free_symbols for f in self.formulas))
+        noise = model.diffusion.free_symbols | model.process_noise.free_symbols
+        moving = {model.t, *model.u} if model.input_hold == "linear" else {model.t}
+        self.exact = self.sampled and self.affine and not drift & moving and not noise & {model.t, *model.u}
 
     def _set_formulas(self) -> None:
         """Set the programs of the motion and of the observation."""
@@ -119,6 +123,13 @@ class System:
         else:
             self.diffusion = numpy_function(g, model, (n, r))
         self.formulas, self.given = (*drift, *potential), tuple(given)
+        linear, whole = _linear_part(drift, x, {*x, model.t, *model.u, *given})
+        self.affine = whole and self.kind == ADDITIVE
+        self.noisy = np.array([any(entry != 0 for entry in g[i, :]) for i in range(n)])
+        for _ in range(n):  # those that noise reaches by the drift
+            reached = {symbol for symbol, noisy in zip(x, self.noisy, strict=True) if noisy}
+            self.noisy |= np.array([bool(f.free_symbols & reached) for f in drift])
+        self.linear_part = None if linear.is_zero_matrix else numpy_function(linear, model, linear.shape)
         self.drift = Expressions([*drift, *potential], model, given, more)
         self.fields = Expressions(fields, model, given, (*more, *coefficients))
         self.process_noise = numpy_function(Q, model, (r, r))
@@ -216,12 +227,18 @@ def _along(function: sp.Expr, field: sp.Matrix, x: tuple[sp.Symbol, ...]) -> sp.
     return total
 
 
-def _is_affine(model: Model) -> bool:
-    """Return whether f is an affine function of the state with a constant matrix."""
-    if model.n**2 > _MOST_ENTRIES:
-        return False
-    free = {*model.x, model.t, *model.u}
-    return not any((sp.diff(f, symbol)).free_symbols & free for f in model.drift for symbol in model.x if f.has(symbol))
+def _linear_part(drift: list[sp.Expr], x: tuple[sp.Symbol, ...], free: set[sp.Symbol]) -> tuple[sp.Matrix, bool]:
+    """Return the constant matrix (n, n) of an affine drift and true, else the constant rates of its coordinates and false.
+
+    Of a drift that is not affine other constant entries of df/dx may be those of motions that others keep stable.
+    """
+    n = len(x)
+    if n**2 > _MOST_ENTRIES:
+        return sp.zeros(n, n), False
+    slopes = sp.Matrix(n, n, lambda i, j: sp.diff(drift[i], x[j]) if drift[i].has(x[j]) else sp.S.Zero)
+    if not slopes.free_symbols & free:
+        return slopes, True
+    return sp.diag(*(sp.S.Zero if slopes[i, i].free_symbols & free else slopes[i, i] for i in range(n))), False
 
 
 def system_of(model: Model) -> System:

@@ -2,7 +2,8 @@
 
     x <- flow of the drift from t_e to t_(e+1);   x <- x + R w,   w ~ N(0, I)
 
-An interval is a list of events: a Runge-Kutta step of order two or four, and a kick of noise after some of them.  Where the noise
+An interval is a list of events: a Runge-Kutta step of order two or four, and a kick of noise after some of them.  The linear
+part of the drift is integrated exactly where it is stiff (`exponential.py`).  Where the noise
 depends on the state a kick is the flow of the fields g_j(x) sqrt(d) w_j over unit time, together where the fields commute, else
 one after the other in an order that a further normal number decides.  With half of a substep's flow before and half after its
 kick the law is that of the equation to second order in the substep.  The drift's outputs after the first n are integrated along
@@ -22,6 +23,18 @@ from numba import types
 from zakai.numerics.compiled import helper, kernel
 from zakai.numerics.formula_kernel import BLOCK
 from zakai.numerics.particles.elementary import add_rows
+from zakai.numerics.particles.exponential import (
+    FIRST,
+    HALF,
+    HALFWAY,
+    LAST,
+    MIDDLE,
+    MINUS_L,
+    WEIGHTS,
+    WHOLE,
+    distinct_weights,
+    write_weights,
+)
 from zakai.numerics.particles.formulas import BOX, F1, F2, F3, I2, PROGRAM, block_of, load_point, mirrored, run_program
 
 Array = Any
@@ -32,8 +45,9 @@ ADDITIVE, COMMUTING, ORDERED = 0, 1, 2
 # substep no particle is thrown far: dry friction holds a velocity near zero, where every step is too long for its sign.
 _ROUGH, _PARTS, _LEVELS = 0.25, 8, 3
 UPDATE = 0  # instead of the evaluations of a flow
-# Drift, fields of the noise, ends of the domain, the kind of the noise, and what an observation makes of the state.
-MOTION = types.Tuple((PROGRAM, PROGRAM, BOX, types.int64, PROGRAM))
+# Drift, fields of the noise, ends of the domain, the kind of the noise, what an observation makes of the state, and L (n, n),
+# the linear part of the drift, or (0, 0).
+MOTION = types.Tuple((PROGRAM, PROGRAM, BOX, types.int64, PROGRAM, F2))
 # Times (E, 2), [root, observation, stages] (E, 3): what follows each flow or -1, and its evaluations, 2 or 4, or `UPDATE`; given
 # numbers at both ends (E, 2, L), roots (J, n or r, d), the first row of the noise of each root, its width, and 1 where a coin
 # follows (J, 3), and the standard deviations of the noise of a substep (E, n).
@@ -45,7 +59,8 @@ class Buffers(NamedTuple):
 
     Rows of a block (rows, BLOCK), given numbers (L,), the times (2,) of a kick, and of the particles of a block: which a step is
     too long for, their places, and which needed a still shorter one (BLOCK,).  `noise` (n,) are the standard deviations of the
-    noise of a substep.
+    noise of a substep.  `weights` (K, 7, n, n) are those of stiff flows, `which` (E,) the row of each event or -1, `part` those
+    of a part of a flow.
     """
 
     work: Array
@@ -55,13 +70,16 @@ class Buffers(NamedTuple):
     marked: Array
     failed: Array
     noise: Array
+    weights: Array
+    which: Array
+    part: Array
 
 
 class Stretch(NamedTuple):
     """A part of a flow.
 
-    The length, the times (2,) and the given numbers (2, L) at both ends of the flow, the evaluations of a step, 2 or 4, and where
-    the part begins and how long it is, as shares of the flow.
+    The length, the times (2,) and the given numbers (2, L) at both ends of the flow, the evaluations of a step, 2 or 4, where
+    the part begins and how long it is, as shares of the flow, and the weights (7, n, n) of a stiff one, else (0, n, n).
     """
 
     length: float
@@ -70,6 +88,7 @@ class Stretch(NamedTuple):
     stages: int
     begin: float
     part: float
+    weights: Array
 
 
 class Kick(NamedTuple):
@@ -98,8 +117,8 @@ ARRIVAL = types.NamedTuple((F2, F1, F3), Arrival)
 @helper
 def _runge_kutta(program: Any, values: Array, x: Array, box: Any, stretch: Any, buffers: Any, size: int) -> int:
     """Write the change of x (rows, size) by one Runge-Kutta step; mark the particles that it is too long for, and count them."""
-    outputs, work, row, rough, noise = program[3], buffers.work, buffers.row, buffers.rough, buffers.noise
-    length, times, given, stages, begin, part = stretch
+    outputs, work, row = program[3], buffers.work, buffers.row
+    length, times, given, stages, begin, part, _ = stretch
     count, rows, n = outputs.size, x.shape[0], box[0].size
     point, total, excess = work[:rows], work[rows : rows + count], work[rows + count : rows + count + n]
     length = part * length
@@ -136,6 +155,83 @@ def _runge_kutta(program: Any, values: Array, x: Array, box: Any, stretch: Any, 
             if stage < stages - 1:
                 for i in range(size):
                     point[d, i] = x[d, i] + ahead * slope[i]
+    return _mark_rough(x, total, excess, buffers, size)
+
+
+@helper
+def _exponential_step(program: Any, values: Array, x: Array, box: Any, stretch: Any, buffers: Any, size: int) -> int:
+    """Do what `_runge_kutta` does with the weights of a stiff linear part."""
+    outputs, work, row, weights = program[3], buffers.work, buffers.row, stretch.weights
+    length, times, given, stages, begin, part, _ = stretch
+    count, rows, n = outputs.size, x.shape[0], box[0].size
+    point, total, excess = work[:rows], work[rows : rows + count], work[rows + count : rows + count + n]
+    base = 2 * (rows + count)
+    y, g, first, half = work[base : base + n], work[base + n :], work[base + 2 * n :], work[base + 3 * n :]
+    g, first, half = g[:n], first[:n], half[:n]
+    length = part * length
+    for d in range(rows):
+        for i in range(size):
+            point[d, i] = x[d, i]
+    for stage in range(stages):
+        share = 0.0 if stage == 0 else (1.0 if stage == 3 else 0.5)
+        at = begin + part * share
+        for j in range(row.size):
+            row[j] = given[0, j] + at * (given[1, j] - given[0, j])
+        load_point(program, values, point, box, times[0] + at * (times[1] - times[0]), row, size)
+        run_program(program, values, size)
+        weight = length / 6.0 if stage == 0 or stage == 3 else length / 3.0
+        sign = length / 6.0 if stage == 0 or stage == 3 else -length / 6.0
+        which = FIRST if stage == 0 else (LAST if stage == 3 else MIDDLE)
+        if stages == 2:
+            weight = 0.0 if stage == 0 else length
+            sign = 0.5 * length if stage == 0 else -0.5 * length
+            which = WHOLE
+        for d in range(n):
+            slope = values[outputs[d]]
+            for i in range(size):
+                g[d, i] = slope[i]
+            if stage > 0:
+                add_rows(g[d], weights[MINUS_L, d], y, size)
+        for d in range(count):
+            for i in range(size if stage == 0 else 0):
+                total[d, i] = 0.0
+                if d < n:
+                    excess[d, i] = 0.0
+            if d >= n:
+                slope = values[outputs[d]]
+                for i in range(size):
+                    total[d, i] += weight * slope[i]
+                continue
+            if weight > 0.0:
+                add_rows(total[d], weights[which, d], g, size)
+            for i in range(size):
+                excess[d, i] += sign * g[d, i]
+        if stage == stages - 1:
+            break
+        for d in range(n):
+            for i in range(size):
+                y[d, i] = 0.0
+            if stage == 2:
+                add_rows(y[d], weights[HALFWAY, d], half, size)
+        for d in range(n):
+            for i in range(size):
+                if stage == 0:
+                    first[d, i] = g[d, i]
+                elif stage == 2:
+                    g[d, i] = 2.0 * g[d, i] - first[d, i]
+        for d in range(n):
+            add_rows(y[d], weights[HALF, d], g, size)
+            for i in range(size):
+                if stage == 0:
+                    half[d, i] = y[d, i]
+                point[d, i] = x[d, i] + y[d, i]
+    return _mark_rough(x, total, excess, buffers, size)
+
+
+@helper
+def _mark_rough(x: Array, total: Array, excess: Array, buffers: Any, size: int) -> int:
+    """Mark the particles that a step is too long for, and count them."""
+    rough, noise, n = buffers.rough, buffers.noise, excess.shape[0]
     for i in range(size):
         rough[i] = 0.0
     for d in range(n):
@@ -149,11 +245,19 @@ def _runge_kutta(program: Any, values: Array, x: Array, box: Any, stretch: Any, 
 
 
 @helper
+def _step(program: Any, values: Array, x: Array, box: Any, stretch: Any, buffers: Any, size: int) -> int:
+    """Write the change of x by one step, exponential where the linear part is stiff."""
+    if stretch.weights.shape[0]:
+        return _exponential_step(program, values, x, box, stretch, buffers, size)
+    return _runge_kutta(program, values, x, box, stretch, buffers, size)
+
+
+@helper
 def _flow(program: Any, values: Array, x: Array, box: Any, stretch: Any, buffers: Any, size: int) -> None:
     """Advance the first rows of x (rows, size) by one Runge-Kutta step, or by as many as a particle needs to be stable."""
     count, rows, rough = program[3].size, x.shape[0], buffers.rough
     change = buffers.work[rows : rows + count]
-    left = _runge_kutta(program, values, x, box, stretch, buffers, size)
+    left = _step(program, values, x, box, stretch, buffers, size)
     if left == 0:
         for d in range(count):
             for i in range(size):
@@ -171,14 +275,17 @@ def _flow(program: Any, values: Array, x: Array, box: Any, stretch: Any, buffers
     for level in range(_LEVELS):
         if left == 0:
             break
-        parts = _PARTS ** (level + 1)
+        parts, weights = _PARTS ** (level + 1), stretch.weights
+        if weights.shape[0]:
+            write_weights(-weights[MINUS_L], stretch.length / parts, buffers.part)
+            weights = buffers.part
         for c in range(left):
             buffers.failed[c] = 0.0
             for d in range(rows):
                 few[d, c] = x[d, marked[c]]
         for p in range(parts):
-            part = Stretch(stretch.length, stretch.times, stretch.given, 4, p / parts, 1.0 / parts)
-            _runge_kutta(program, values, few, box, part, buffers, left)
+            part = Stretch(stretch.length, stretch.times, stretch.given, 4, p / parts, 1.0 / parts, weights)
+            _step(program, values, few, box, part, buffers, left)
             for c in range(left):
                 buffers.failed[c] += rough[c]
                 for d in range(count):
@@ -207,7 +314,10 @@ def _kick(motion: Any, values: Array, x: Array, kick: Any, buffers: Any, size: i
     # The point of the fields: the state, then a coefficient for each field.
     r = root.shape[0]
     point = work[: n + r]
-    rest = Buffers(work[n + r :], buffers.row, buffers.time, buffers.rough, buffers.marked, buffers.failed, buffers.noise)
+    rest = Buffers(
+        work[n + r :], buffers.row, buffers.time, buffers.rough, buffers.marked, buffers.failed, buffers.noise, buffers.weights,
+        buffers.which, buffers.part,
+    )
     for d in range(n):
         for i in range(size):
             point[d, i] = x[d, i]
@@ -222,7 +332,7 @@ def _kick(motion: Any, values: Array, x: Array, kick: Any, buffers: Any, size: i
                     j = turn if noise[width, i] > 0.0 else width - 1 - turn
                     value = root[a, j] * noise[j, i]
                 point[n + a, i] = value
-        _flow(fields, values, point, motion[2], Stretch(1.0, buffers.time, given, 4, 0.0, 1.0), rest, size)
+        _flow(fields, values, point, motion[2], Stretch(1.0, buffers.time, given, 4, 0.0, 1.0, buffers.part[:0]), rest, size)
     for d in range(n):
         for i in range(size):
             x[d, i] = point[d, i]
@@ -250,7 +360,9 @@ def run_event(motion: Any, events: Any, e: int, blocks: Any, x: Array, noise: Ar
     if times[e, 1] != times[e, 0]:
         for d in range(n):
             buffers.noise[d] = spreads[e, d]
-        stretch = Stretch(times[e, 1] - times[e, 0], times[e], given[e], places[e, 2], 0.0, 1.0)
+        k = buffers.which[e]
+        weights = buffers.weights[k] if k >= 0 else buffers.part[:0]
+        stretch = Stretch(times[e, 1] - times[e, 0], times[e], given[e], places[e, 2], 0.0, 1.0, weights)
         _flow(motion[0], blocks[0], x, box, stretch, buffers, size)
     r = places[e, 0]
     if r >= 0:
@@ -277,8 +389,10 @@ def buffers_of(motion: Any, events: Any) -> Any:
     """Return what `run_event` overwrites."""
     n, r = motion[2][0].size, events[3].shape[1]
     work, row = np.empty((9 * (n + r + 2), BLOCK)), np.empty(events[2].shape[2])
-    noise = np.zeros(motion[2][0].size)
-    return Buffers(work, row, np.empty(2), np.empty(BLOCK), np.empty(BLOCK, np.int64), np.empty(BLOCK), noise)
+    noise, which, L = np.zeros(motion[2][0].size), np.empty(len(events[0]), np.int64), motion[5]
+    weights, part = distinct_weights(L, events[0], which), np.empty((WEIGHTS, *L.shape))
+    marked = np.empty(BLOCK, np.int64)
+    return Buffers(work, row, np.empty(2), np.empty(BLOCK), marked, np.empty(BLOCK), noise, weights, which, part)
 
 
 @kernel(types.void(MOTION, EVENTS, F2, F2, types.int64, types.int64, ARRIVAL))

@@ -15,6 +15,7 @@ from numba import types
 
 from zakai.numerics.compiled import helper, kernel
 from zakai.numerics.formula_kernel import BLOCK
+from zakai.numerics.particles.exponential import norm_of
 from zakai.numerics.particles.formulas import BOX, F1, F2, F3, PROGRAM, block_of, load_point, run_program
 from zakai.numerics.particles.motion import EVENTS, MOTION, buffers_of, run_event
 from zakai.numerics.small_matrices import assign, multiply
@@ -22,8 +23,8 @@ from zakai.numerics.small_matrices import assign, multiply
 Array = Any
 _SERIES = 4.0  # norm of A times the length up to which Q is a series; twice as long by halves
 _SMALL = 1e-11  # residual of a variance, relative to it, that is no direction of its own
-# Norm of df/dx times a substep above which it is reduced where f is not linear: noise that is carried far to the middle of a
-# substep is amplified there, and a nonlinear flow does not take that back.
+# Spectral radius of df/dx without the linear part, times a substep, above which that is reduced: noise that is carried far to the
+# middle of a substep is amplified there, and a nonlinear flow does not take that back.
 _CARRIED = 2.0
 _STEP = 1e-5  # of forward differences, in standard deviations
 
@@ -161,21 +162,29 @@ def _congruence(M: Array, Q: Array, product: Array, out: Array) -> None:
 
 
 @helper
-def _reduced(A: Array, length: float, out: Array) -> None:
-    """Write A, made smaller where its norm times the length is above `_CARRIED`."""
-    n, norm = A.shape[0], 0.0
+def _reduced(A: Array, L: Array, length: float, out: Array) -> None:
+    """Write A, with A - L made smaller where its spectral radius times the length is above `_CARRIED`; L may be (0, 0).
+
+    The radius is estimated by the eighth power, so that it hardly depends on the units of the states.
+    """
+    n, linear = A.shape[0], L.shape[0] > 0
+    power, product = np.empty((n, n)), np.empty((n, n))
     for i in range(n):
-        total = 0.0
         for j in range(n):
-            total += abs(A[i, j])
-        norm = max(norm, total * length)
+            power[i, j] = A[i, j] - L[i, j] if linear else A[i, j]
+    for _ in range(3):
+        multiply(product, power, power)
+        assign(power, product)
+    radius = norm_of(power) ** 0.125 * length
+    share = _CARRIED / radius if radius > _CARRIED else 1.0
     for i in range(n):
         for j in range(n):
-            out[i, j] = A[i, j] * (_CARRIED / norm if norm > _CARRIED else 1.0)
+            exact = L[i, j] if linear and share < 1.0 else 0.0
+            out[i, j] = exact + share * (A[i, j] - exact)
 
 
 @helper
-def _noise_across(times: Array, slopes: Array, e: int, G: Array, length: float, out: Array) -> None:
+def _noise_across(times: Array, slopes: Array, e: int, G: Array, length: float, L: Array, out: Array) -> None:
     """Write the noise of a substep in which df/dx jumps, carried to its middle, where event e (E, 2) ends.
 
     `slopes` (E, n, n) are df/dx at the ends of the events, which end at jumps, too.
@@ -190,7 +199,7 @@ def _noise_across(times: Array, slopes: Array, e: int, G: Array, length: float, 
         f, source, first, last = e if side < 0 else e + 1, e, middle - 0.5 * length, middle + 0.5 * length
         while 0 <= f < times.shape[0] and times[f, 1] > first and times[f, 0] < last:
             own = min(times[f, 1], last) - max(times[f, 0], first)
-            _reduced(slopes[source], own, A)
+            _reduced(slopes[source], L, own, A)
             noise_about(A, G, own, Q)
             _exponential(A, -0.5 * side * own, E)
             multiply(product, M, E)
@@ -273,7 +282,7 @@ def kick_roots(motion: Any, events: Any, A: Array, length: float, about: Array, 
         if j >= 0 and A.size:
             assign(slopes[j], slope)
         elif j >= 0:
-            _reduced(slope, length, slopes[j])
+            _reduced(slope, motion[5], length, slopes[j])
     for e in range(count):
         j = places[e, 0]
         if j < 0:
@@ -281,7 +290,7 @@ def kick_roots(motion: Any, events: Any, A: Array, length: float, about: Array, 
         own = G[j if G.shape[0] > 1 else 0]
         before, after = times[e, 0] > times[e, 1] - 0.5 * length, e + 1 < count and times[e + 1, 1] < times[e, 1] + 0.5 * length
         if not A.size and count > slopes.shape[0] + 1 and (before or after):
-            _noise_across(times, ends, e, own, length, Q)
+            _noise_across(times, ends, e, own, length, motion[5], Q)
         else:
             noise_about(slopes[j], own, length, Q)
         width = max(width, root_of(Q, out[j], pivots))

@@ -91,12 +91,22 @@ def moments(x: Array, weights: Array, angles: Array, mean: Array, deviations: Ar
             cov[e, d] = cov[d, e]
 
 
-@kernel(types.void(I8, F1, F2, F2, F1, F1), reordered=True)
-def sums_of_islands(bounds: Array, weights: Array, deviations: Array, sums: Array, masses: Array, independent: Array) -> None:
-    """Write the sums of weights (R,) and of weighted deviations (R, n) of the particles of each island.
+class Sums(NamedTuple):
+    """The sums of weights (R,), of weighted deviations and of their squares (R, n) of the particles of each island.
 
-    `independent` (n,) receives the variances of the means of independent particles with these weights.
+    `independent` (n,) are the variances of the means of independent particles with these weights.
     """
+
+    masses: Array
+    deviations: Array
+    squares: Array
+    independent: Array
+
+
+@kernel(types.void(I8, F1, F2, types.NamedTuple((F1, F2, F2, F1), Sums)), reordered=True)
+def sums_of_islands(bounds: Array, weights: Array, deviations: Array, out: Any) -> None:
+    """Write the sums over the particles of each island, from one of the bounds (R + 1,) to the next."""
+    masses, sums, squares, independent = out
     n, count = deviations.shape
     for d in range(n):
         independent[d] = 0.0
@@ -105,12 +115,13 @@ def sums_of_islands(bounds: Array, weights: Array, deviations: Array, sums: Arra
         for i in range(bounds[island], bounds[island + 1]):
             masses[island] += weights[i]
         for d in range(n):
-            total, square = 0.0, 0.0
+            total, square, wide = 0.0, 0.0, 0.0
             for i in range(bounds[island], bounds[island + 1]):
                 part = weights[i] * deviations[d, i]
                 total += part
                 square += part * part
-            sums[island, d] = total
+                wide += part * deviations[d, i]
+            sums[island, d], squares[island, d] = total, wide
             independent[d] += square
     for d in range(n):
         independent[d] *= count / max(count - 1, 1)
