@@ -69,8 +69,11 @@ def part_of(window: lw.Window, first: int, last: int) -> lw.Window:
     return window._replace(size=size, centre=float(window.offsets[first + size // 2]))
 
 
+NARROWEST = 0.3  # deviation of the product, in spacings, that a grid can hold
+
+
 def placed(message: Message, centre: float, deviation: float, spacing: float, reach: float) -> Psi | None:
-    """Return psi of a message on a grid about a mean, None where that is too large or psi is not finite.
+    """Return psi of a message on a grid about a mean, None where that is too large or too coarse, or psi is not finite.
 
     Beyond the ends of the message psi differs from a Gaussian by a factor.
     """
@@ -79,6 +82,8 @@ def placed(message: Message, centre: float, deviation: float, spacing: float, re
         return None
     window = message.window._replace(centre=centre, spacing=spacing, size=lw.size_for(count))
     deviation /= spacing
+    if not deviation > NARROWEST:
+        return None
     ends = np.array(message.ends)
     z, inner = lw.index(window.size) / deviation, np.clip(window.offsets, *ends)
     at, logs = (inner - centre) / (spacing * deviation), message.at(inner)
