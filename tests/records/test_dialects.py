@@ -63,3 +63,11 @@ def test_dates_and_inputs_may_be_written_so_too(tmp_path):
     heated = zakai.load_model("gallery:heated-room")
     (tmp_path / "inputs.csv").write_text("# heater in kW\ntime;outdoor;heater\n0;5;1,5\n")
     np.testing.assert_array_equal(read_inputs(tmp_path / "inputs.csv", heated).values, [[1.5, 5]])
+
+
+def test_a_missing_value_may_end_a_line_in_the_middle(tmp_path):
+    path = tmp_path / "record.csv"
+    path.write_text("time,range\n0.5,1.25\n1,NA\n1.5,7\n", encoding="utf-8")
+    model = zakai.Model(state=["x"], drift=["-x"], observation=["x"], observation_kind="samples")
+    values = read_record(path, model).values[:, 0]
+    assert np.array_equal(values, [1.25, np.nan, 7.0], equal_nan=True)

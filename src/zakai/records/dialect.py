@@ -14,7 +14,7 @@ from zakai.records.numbers import NUMBER
 
 SEPARATORS = {",": "a comma", ";": "a semicolon", "\t": "a tab"}
 _OTHERS = {"|": "a bar", " ": "a space", ":": "a colon"}
-_MISSING = re.compile(r'(^|,)\s*"?(?:NA|N/A|n/a|na|null|NULL|None|<NA>|#N/A)"?\s*(?=,|$)')
+_MISSING = re.compile(r'(^|,)[ \t]*"?(?:NA|N/A|n/a|na|null|NULL|None|<NA>|#N/A)"?[ \t]*(?=,|$)', re.MULTILINE)
 _DECIMAL_COMMA = re.compile(r"[+-]?(\d+,\d*|,\d+)(e[+-]?\d+)?", re.IGNORECASE)
 TIMES = ("time", "t", "date", "datetime", "timestamp")  # names of the first column: `t` is the time in formulas too
 _UNIT = re.compile(r"\s*(\[[^]]*\]|\([^)]*\))\s*$")  # behind a name, as in "Time [s]"
